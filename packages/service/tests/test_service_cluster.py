@@ -27,7 +27,7 @@ from starcat.errors import ProductError
 from starcat.pipeline.specs.reading import spec_from_dict
 from starcat_service.access import Principal
 from starcat_service.jobs import slots as slots_module
-from starcat_service.jobs.cluster import pack, place
+from starcat_service.jobs.cluster import pack, store_result
 from starcat_service.jobs.job import Job
 from starcat_service.jobs.slots import JobSlots
 from starcat_service.jobs.submission import (
@@ -92,7 +92,7 @@ def test_a_folder_that_is_not_a_database_gets_no_place(service, job, tmp_path):
         made = ServicePaths(tmp_path / "made")
         made.root.mkdir()
         with pytest.raises((ProductError, tarfile.TarError, OSError)):
-            place(content, job, made, service.paths)
+            store_result(content, job, made, service.paths)
         shutil.rmtree(made.root)
         assert sorted(tmp_path.rglob("*")) == before, name
 
@@ -109,16 +109,18 @@ def test_only_the_whole_database_of_the_job_gets_its_place(
 ):
     made = ServicePaths(tmp_path / "made")
     with pytest.raises(ProductError):
-        place(built(tmp_path / "b", job, database_version("2.0.0")), job, made, service.paths)
+        store_result(
+            built(tmp_path / "b", job, database_version("2.0.0")), job, made, service.paths
+        )
     archive = bytearray(built(tmp_path / "a", job, small_database))
     archive[archive.index(b"PAR1", len(archive) // 2) - 100] ^= 1
     for damaged in (bytes(archive), bytes(archive[: len(archive) // 2])):
         with pytest.raises((ProductError, tarfile.TarError)):
-            place(damaged, job, made, service.paths)
+            store_result(damaged, job, made, service.paths)
     assert service.library.databases() == []
     shutil.rmtree(made.root)
     for _ in range(2):  # Dask may do a task twice
-        place(pack(tmp_path / "a", tmp_path / "a" / "databases"), job, made, service.paths)
+        store_result(pack(tmp_path / "a", tmp_path / "a" / "databases"), job, made, service.paths)
     [database] = service.library.databases()
     assert verify(database.folder).findings == ()
     assert {path.stat().st_mode & 0o222 for path in database.folder.iterdir()} == {0}

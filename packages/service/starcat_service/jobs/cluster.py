@@ -211,7 +211,7 @@ class ClusterJobs:
             full = self._service.quota.database_excess(job.owner, len(result.archive))
             if full is not None and result.archive:
                 return limit_exceeded(full)
-            place(result.archive, job, ServicePaths(work), paths)
+            store_result(result.archive, job, ServicePaths(work), paths)
         except (ProductError, TarError, OSError) as error:
             detail = f"what {result.worker} has made cannot be taken: {error}"
             return failed("Damaged", 422, detail)
@@ -243,13 +243,13 @@ def unpack(archive: bytes, root: Path) -> None:
                 target.write_bytes(data.read())
 
 
-def place(archive: bytes, job: Job, made: ServicePaths, paths: ServicePaths) -> None:
+def store_result(archive: bytes, job: Job, unpacked: ServicePaths, paths: ServicePaths) -> None:
     """Unpack and check the result of a worker for a job, and move it to its place."""
     if not archive:
         return
-    unpack(archive, made.root)
+    unpack(archive, unpacked.root)
     if job.kind == "build":
-        spec, folder = job.request["spec"], made.database(job.key[:16])
+        spec, folder = job.request["spec"], unpacked.database(job.key[:16])
         database = check_database(folder / f"{spec['name']}-{spec['version']}")
         if database.manifest["spec"] != spec:
             raise ProductError("the database was built by another spec")
@@ -258,7 +258,7 @@ def place(archive: bytes, job: Job, made: ServicePaths, paths: ServicePaths) -> 
         place_database(folder, paths.database(job.key[:16]))
         return
     name = f"{job.request['source']}-{job.key[:16]}"  # after its rejected records
-    for path in sorted(made.catalogs.iterdir(), key=lambda one: one.stem == name):
+    for path in sorted(unpacked.catalogs.iterdir(), key=lambda path: path.stem == name):
         path.replace(paths.catalogs / path.name)
     sync_to_disk(paths.catalogs)
 
@@ -282,8 +282,8 @@ def do_task(order: Order, job_time_s: float, database: bytes | None) -> ClusterR
             unpack(database, paths.root)
         order = replace(order, root=root, threads=threads_of(worker.state.nthreads))
         outcome = _followed(worker, order, job_time_s)
-        made = {"build": (paths.databases,), "ingest": (paths.catalogs,)}.get(order.kind, ())
-        archive = pack(paths.root, *made) if made and outcome.state == "done" else b""
+        folders = {"build": (paths.databases,), "ingest": (paths.catalogs,)}.get(order.kind, ())
+        archive = pack(paths.root, *folders) if folders and outcome.state == "done" else b""
         stderr = paths.job_stderr(order.job_id).read_bytes()
     return ClusterResult(worker.address, outcome, "", archive, stderr)
 
@@ -306,18 +306,18 @@ def _refusal(order: Order, home: Path) -> str:
 
 def _followed(worker: Worker, order: Order, job_time_s: float) -> Outcome:
     task, began_s = worker.get_current_task(), time.monotonic()
-    told_s = -HEARTBEAT_S
+    reported_s = -HEARTBEAT_S
 
     def report(message: dict[str, Any]) -> None:
-        nonlocal told_s
+        nonlocal reported_s
         worker.log_event(TOPIC, {**message, "task": task})
-        told_s = time.monotonic()
+        reported_s = time.monotonic()
 
     def reason_to_end() -> Outcome | None:
-        if time.monotonic() - told_s >= HEARTBEAT_S:
+        if time.monotonic() - reported_s >= HEARTBEAT_S:
             report({})
-        known = worker.state.tasks.get(task)
-        if known is None or known.state not in ("executing", "long-running"):
+        state = worker.state.tasks.get(task)
+        if state is None or state.state not in ("executing", "long-running"):
             return CANCELLED  # cancelled by the server, or together with the server
         return time_exceeded(began_s, job_time_s)
 

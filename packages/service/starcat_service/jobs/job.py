@@ -121,8 +121,8 @@ class JobStore:
     ) -> int:
         """Return how many jobs there are."""
         where, values = _where(text, state=state, kind=kind, owner=owner, database=database)
-        [[found]] = self._records.rows(f"SELECT count(*) FROM jobs {where}", *values)
-        return int(found)
+        [[count]] = self._records.rows(f"SELECT count(*) FROM jobs {where}", *values)
+        return int(count)
 
     def events(self, job_id: str, after: int = 0) -> list[Event]:
         """Return the events of a job."""
@@ -137,10 +137,10 @@ class JobStore:
 _COLUMNS = {"database": "json_extract(request, '$.database')"}
 
 
-def _where(text: str | None, **wanted: str | None) -> tuple[str, list[str]]:
-    given = {name: value for name, value in wanted.items() if value is not None}
-    conditions = ["kind != ?", *(f"{_COLUMNS.get(name, name)} = ?" for name in given)]
-    values = [*given.values()]
+def _where(text: str | None, **columns: str | None) -> tuple[str, list[str]]:
+    filters = {name: value for name, value in columns.items() if value is not None}
+    conditions = ["kind != ?", *(f"{_COLUMNS.get(name, name)} = ?" for name in filters)]
+    values = [*filters.values()]
     for word in (text or "").split():
         conditions.append("instr(lower(title || ' ' || kind || ' ' || owner || ' ' || id), ?) > 0")
         values.append(word.lower())
@@ -253,13 +253,13 @@ class Attempt:
 
     def cancel_requested(self) -> bool:
         """Return whether it must end: the job was cancelled, or belongs to another attempt."""
-        wanted = self._records.rows(
+        rows = self._records.rows(
             "SELECT 1 FROM jobs WHERE id = ? AND attempt = ? AND state = 'running' "
             "AND NOT cancel_requested",
             self.job.id,
             self.job.attempt,
         )
-        return not wanted
+        return not rows
 
     def report(self, message: Mapping[str, Any]) -> None:
         """Take a message of the process: ``stage``, ``done``, ``total``; or ``log``, ``level``."""
@@ -331,14 +331,16 @@ def finish_job(
 ) -> None:
     """Record the end of a job, within a transaction."""
     column = {"done": "result", "failed": "error"}.get(state)
-    told = {} if column is None else {column: dict(content)}
-    result, error = (json.dumps(told[one]) if one in told else None for one in ("result", "error"))
+    columns = {} if column is None else {column: dict(content)}
+    result, error = (
+        json.dumps(columns[name]) if name in columns else None for name in ("result", "error")
+    )
     connection.execute(
         "UPDATE jobs SET state = ?, ended_s = ?, cancel_requested = 0, result = ?, error = ? "
         "WHERE id = ?",
         (state, time.time(), result, error, job_id),
     )
-    add_event(connection, job_id, "state", {"state": state, **told})
+    add_event(connection, job_id, "state", {"state": state, **columns})
 
 
 def add_event(

@@ -60,14 +60,14 @@ def source_digests(records: Records, name: str) -> list[str]:
 
 def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
     """Return the files of a source."""
-    found: list[Path] = []
+    files: list[Path] = []
     for path in paths:
         if path.is_dir() and is_store(path):
             # The metadata of a store lists its partitions with their digests.
-            found += sorted(one for one in path.iterdir() if one.is_file())
+            files += sorted(file for file in path.iterdir() if file.is_file())
         else:
-            found += [file.path for file in SourceFiles.find(data_source(name), [path]).files]
-    return found
+            files += [file.path for file in SourceFiles.find(data_source(name), [path]).files]
+    return files
 
 
 def file_digests(records: Records, paths: Iterable[Path]) -> list[str]:
@@ -81,8 +81,8 @@ def _digest(records: Records, path: Path) -> str:
         text = f"{path} {stat.st_size} {stat.st_mtime_ns}"
         return hashlib.sha256(text.encode()).hexdigest()
     facts = (str(path), stat.st_size, stat.st_mtime_ns)
-    known = "SELECT sha256 FROM file_digests WHERE path = ? AND size_bytes = ? AND changed_ns = ?"
-    for row in records.rows(known, *facts):
+    query = "SELECT sha256 FROM file_digests WHERE path = ? AND size_bytes = ? AND changed_ns = ?"
+    for row in records.rows(query, *facts):
         return str(row["sha256"])
     digest = file_sha256(path)
     with records.writing() as connection:

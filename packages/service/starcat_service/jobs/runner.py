@@ -65,20 +65,20 @@ class Processes:
     def run(self, order: Order, report: Report, reason_to_end: ReasonToEnd) -> Outcome:
         """Run the process of a job until it ends or must end."""
         ended: Outcome | None = None
-        told: Outcome | None = None
+        outcome: Outcome | None = None
         looked_s = time.monotonic()
         with self._started(order) as worker, suppress(EOFError, MalformedMessage):
             while True:
                 reply = worker.receive(TICK_S)
                 if reply is not None:
-                    told = _outcome_of(*reply, report) or told
-                if time.monotonic() - looked_s >= TICK_S and ended is None and told is None:
+                    outcome = _outcome_of(*reply, report) or outcome
+                if time.monotonic() - looked_s >= TICK_S and ended is None and outcome is None:
                     looked_s = time.monotonic()
                     ended = reason_to_end()
                     if ended is not None:
                         worker.kill()
-        if told is not None and (told.state == "done" or ended is None):
-            return told  # it was finished before it could be ended
+        if outcome is not None and (outcome.state == "done" or ended is None):
+            return outcome  # it was finished before it could be ended
         return ended or _death(worker.wait() or 0, order)
 
     def end_all(self) -> None:
@@ -108,12 +108,12 @@ class Processes:
 
 
 def _outcome_of(kind: str, content: bytes | bytearray, report: Report) -> Outcome | None:
-    found: dict[str, Any] = from_json(content)
+    message: dict[str, Any] = from_json(content)
     if kind == DONE:
-        return Outcome("done", found)
+        return Outcome("done", message)
     if kind == ERROR:
-        return Outcome("failed", found)
-    report(found)
+        return Outcome("failed", message)
+    report(message)
     return None
 
 

@@ -121,12 +121,12 @@ class JobSlots:
 
     def _lanes(self) -> tuple[_Lane, _Lane]:
         service, cluster = self.service, self.cluster
-        made = _Lane("job", MADE_BY_PROCESSES, service.settings.workers, self.run_process)
+        lane = _Lane("job", MADE_BY_PROCESSES, service.settings.workers, self.run_process)
         if cluster is not None:
-            made = _Lane("job", made.kinds, made.count, cluster.run, cluster.is_ready)
+            lane = _Lane("job", lane.kinds, lane.count, cluster.run, cluster.is_ready)
         # One of the concurrent queries is reserved for clients who wait for the answer.
         queries = max(1, service.settings.queries - 1)
-        return made, _Lane("query", (QUERY,), queries, self._answer_query)
+        return lane, _Lane("query", (QUERY,), queries, self._answer_query)
 
     def _serve(self, lane: _Lane) -> None:
         records, queued = self.service.records, self.service.job_queued
@@ -194,8 +194,8 @@ class JobSlots:
             full = disk_shortage(service.settings)
             if full is None and time.monotonic() - disk_at_s >= DISK_TICK_S:
                 disk_at_s = time.monotonic()
-                made = folder_bytes(service.paths.job(job.id))
-                full = service.quota.database_excess(job.owner, made)
+                used_bytes = folder_bytes(service.paths.job(job.id))
+                full = service.quota.database_excess(job.owner, used_bytes)
             return None if full is None else limit_exceeded(full)
 
         return watch

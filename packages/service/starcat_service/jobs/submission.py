@@ -72,7 +72,11 @@ def check_free(service: Service, spec: BuildSpec, key: str | None = None) -> Non
 
     ``key`` is the key of its build; it is computed only if it is needed.
     """
-    taken = {(one.version, one.id) for one in service.library.databases() if one.name == spec.name}
+    taken = {
+        (database.version, database.id)
+        for database in service.library.databases()
+        if database.name == spec.name
+    }
     for row in service.records.rows(
         "SELECT title, key FROM jobs WHERE kind = 'build' AND state IN ('queued', 'running')"
     ):
@@ -147,10 +151,10 @@ def photographs_database(service: Service) -> Path:
     If it is not there, its job is queued, and a `BeingBuilt` is raised. A job that failed is not
     repeated by requests: a publisher can retry it.
     """
-    made = blind_folder(service.paths.blind)
-    if made.is_dir():
-        return made
-    key = key_of("photographs", {"folder": made.parent.name})
+    folder = blind_folder(service.paths.blind)
+    if folder.is_dir():
+        return folder
+    key = key_of("photographs", {"folder": folder.parent.name})
     newest = "SELECT id FROM jobs WHERE key = ? ORDER BY created_s DESC, id LIMIT 1"
     for row in service.records.rows(newest, key):
         job = service.jobs.get(row["id"])
@@ -163,8 +167,8 @@ def photographs_database(service: Service) -> Path:
             )
     title = "database for photographs"
     job = submit(service, "photographs", {}, key, title, SERVICE_ITSELF).job
-    if made.is_dir():
-        return made
+    if folder.is_dir():
+        return folder
     raise BeingBuilt(job.id)
 
 

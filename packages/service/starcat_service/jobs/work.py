@@ -110,10 +110,10 @@ def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     from starcat.pipeline.specs import spec_from_dict
 
     spec = spec_from_dict(dict(order.request["spec"]), "spec")
-    made = order.work / database_id
+    folder = order.work / database_id
     built = build(
         spec,
-        made,
+        folder,
         workers=order.threads,
         progress=progress,
         announce=lambda cost: log("info", cost.in_words),
@@ -128,17 +128,17 @@ def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         "info",
         f"{clean.identified} of {clean.frames} clean frames were identified, {clean.wrong} wrongly",
     )
-    place_database(made, order.paths.database(database_id))
+    place_database(folder, order.paths.database(database_id))
     return result
 
 
-def place_database(made: Path, final: Path) -> None:
+def place_database(folder: Path, final: Path) -> None:
     """Give the folder of a database its name, in one step."""
-    sync_to_disk(made)
+    sync_to_disk(folder)
     if final.is_dir():
-        replace_folder(made, final)
+        replace_folder(folder, final)
         return
-    made.rename(final)
+    folder.rename(final)
     sync_to_disk(final.parent)
 
 
@@ -152,14 +152,14 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     name = f"{source}-{order.key[:16]}" + (".parquet" if to == "parquet" else "")
     result: dict[str, Any] = {"catalog": name, "source": source}
     final = order.paths.catalogs / name
-    made = order.work / name
+    output = order.work / name
     if to == "hats":
         from starcat.catalog.store import StoreOptions, ingest_to_store
 
         options = StoreOptions(
             memory_bytes=order.memory_bytes, workers=order.threads, scheduler=order.scheduler
         )
-        stored = ingest_to_store(source, paths, made, **how, options=options, progress=progress)
+        stored = ingest_to_store(source, paths, output, **how, options=options, progress=progress)
         problems, notes, rows = stored.problems, stored.notes, int(stored.manifest["kept"])
     else:
         from starcat.catalog import write_star_tables
@@ -167,16 +167,16 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         from starcat.catalog.store import read_catalog
 
         read = read_catalog(source, paths, **how, workers=order.threads, progress=progress)
-        write_star_tables(read, made)
+        write_star_tables(read, output)
         problems, notes, rows = read.problems, read.notes, len(read.stars)
-        if rejected_path(made).exists():
-            rejected_path(made).replace(rejected_path(final))
+        if rejected_path(output).exists():
+            rejected_path(output).replace(rejected_path(final))
     for line in (*problems, *notes):
         log("warning", line)
-    if made.is_dir() and final.is_dir():  # the same content: it has the same key
-        shutil.rmtree(made)
+    if output.is_dir() and final.is_dir():  # the same content: it has the same key
+        shutil.rmtree(output)
     else:
-        made.replace(final)
+        output.replace(final)
     sync_to_disk(final.parent)
     return {**result, "rows": rows}
 
@@ -221,10 +221,10 @@ def _photographs(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     if final.is_dir():
         log("info", "the database for photographs is there already")
     else:
-        made = blind_database(progress, order.work).parent
+        folder = blind_database(progress, order.work).parent
         shutil.rmtree(order.paths.blind, ignore_errors=True)  # of an older version
         order.paths.blind.mkdir(parents=True)
-        place_database(made, final)
+        place_database(folder, final)
     return {"folder": str(final.relative_to(order.paths.root))}
 
 

@@ -25,7 +25,7 @@ def catalogs_page(request: Request, service: TheService, reader: Reader) -> Resp
     return render(
         request,
         "catalogs.html",
-        found=api.all_catalogs(service, reader),
+        listing=api.all_catalogs(service, reader),
         may_read=reader.role >= Role.BUILDER,
         may_remove=reader.role >= Role.PUBLISHER,
     )

@@ -98,8 +98,8 @@ async def answer_file(
     """Return all rows of an answer as a file."""
     database = service.library.database(database_id)
     query = _query(service, database.id, asked, form)
-    found = await service.query_pool.run(result_file, service, query, form, database.title)
-    return found[0]
+    file = await service.query_pool.run(result_file, service, query, form, database.title)
+    return file[0]
 
 
 def _rows(service: Service, database_id: str, form: ConsoleForm) -> ResultTable:
@@ -119,12 +119,12 @@ def _query(
         format=file_format,
         max_rows=form.rows if file_format == "rows" else None,
     )
-    chosen = _chosen(form.named)
-    if chosen is not None and form.query.strip() == chosen.text.strip():
-        known = {value.name for value in chosen.values}
-        values = {name: text for name, text in form.values.items() if name in known}
-        named = {"query": None, "named": chosen.name, "values": values}
-        question = question.model_copy(update=named)
+    named = _named_query(form.named)
+    if named is not None and form.query.strip() == named.text.strip():
+        names = {value.name for value in named.values}
+        values = {name: text for name, text in form.values.items() if name in names}
+        changes = {"query": None, "named": named.name, "values": values}
+        question = question.model_copy(update=changes)
     return query_of(service, question)
 
 
@@ -140,9 +140,9 @@ def _page(
     if is_part:
         return render(request, "console_answer.html", status=status, **content)
     form: ConsoleForm = content["asked"]
-    chosen = _chosen(form.named)
-    text = form.query or (chosen.text if chosen else FIRST)
-    others = [one for one in service.library.databases() if one.id != database.id]
+    named = _named_query(form.named)
+    text = form.query or (named.text if named else FIRST)
+    others = [other for other in service.library.databases() if other.id != database.id]
     return render(
         request,
         "console.html",
@@ -152,9 +152,9 @@ def _page(
         formats={name: FORMATS[name].title for name in PAGE_FORMATS},
         tab="sql",
         text=text,
-        chosen=chosen,
-        values=_values_in(text, chosen, form.values),
-        others=[(one.id, one.title) for one in others],
+        named=named,
+        values=_values_in(text, named, form.values),
+        others=[(other.id, other.title) for other in others],
         queries=list(named_queries().values()),
         macros=sorted(macros(), key=lambda macro: (not macro.is_table, macro.name)),
         products=products_of(database.manifest),
@@ -178,36 +178,38 @@ def _view(database: ListedDatabase, answer: ResultTable) -> dict[str, Any] | Non
     columns = {column.name: k for k, column in enumerate(answer.columns)}
     if not {"ra_deg", "dec_deg"} <= set(columns):
         return None
-    known = {name: columns.get(name) for name in ("designation", "mag", "star_id", "reason")}
+    column_numbers = {
+        name: columns.get(name) for name in ("designation", "mag", "star_id", "reason")
+    }
     marks = []
     for row in answer.rows[:MARKS]:
         ra, dec = row[columns["ra_deg"]], row[columns["dec_deg"]]
-        if not all(isinstance(one, int | float) for one in (ra, dec)):
+        if not all(isinstance(angle, int | float) for angle in (ra, dec)):
             continue
-        said = {name: None if k is None else row[k] for name, k in known.items()}
+        said = {name: None if k is None else row[k] for name, k in column_numbers.items()}
         mag = said["mag"] if isinstance(said["mag"], int | float) else None
         label = str(said["designation"] or f"{answer.columns[0].name} {row[0]}")
         star_id = None if said["star_id"] is None else str(said["star_id"])
         marks.append(SkyStar(label, ra, dec, mag, star_id, reason=in_words(said["reason"])))
     if not marks:
         return None
-    return sky_view(database, marks=marks, at=around([vars(one) for one in marks]))
+    return sky_view(database, marks=marks, at=around([vars(mark) for mark in marks]))
 
 
-def _chosen(name: str) -> NamedQuery | None:
+def _named_query(name: str) -> NamedQuery | None:
     return named_query(name) if name else None
 
 
 def _values_in(
-    text: str, chosen: NamedQuery | None, given: Mapping[str, str]
+    text: str, named: NamedQuery | None, texts: Mapping[str, str]
 ) -> list[tuple[str, str, str]]:
     """Return name, text and meaning of the values that a query accepts."""
-    known = {value.name: value for value in chosen.values} if chosen else {}
+    declared = {value.name: value for value in named.values} if named else {}
     return [
         (
             name,
-            given.get(name, str(known[name].default) if name in known else ""),
-            known[name].help if name in known else "",
+            texts.get(name, str(declared[name].default) if name in declared else ""),
+            declared[name].help if name in declared else "",
         )
         for name in dict.fromkeys(_NAMES.findall(text))
     ]

@@ -128,14 +128,14 @@ def coverage_page(
     """Show the view of the sky and the fields of the tiling."""
     database = service.library.database(database_id)
     fields = fields_of(database)
-    chosen = [
+    matching = [
         number
         for number in _ordered(fields, order)
         if not at_most or fields.stars[number] <= int(at_most)
     ]
-    pages = max(1, -(-len(chosen) // FIELDS_SHOWN))
+    pages = max(1, -(-len(matching) // FIELDS_SHOWN))
     page = min(page, pages)
-    numbers = chosen[(page - 1) * FIELDS_SHOWN : page * FIELDS_SHOWN]
+    numbers = matching[(page - 1) * FIELDS_SHOWN : page * FIELDS_SHOWN]
     return render(
         request,
         "coverage.html",
@@ -151,7 +151,7 @@ def coverage_page(
         pages=pages,
         at_most=at_most,
         count=len(fields),
-        chosen=len(chosen),
+        matching=len(matching),
         notebook=_fields_notebook(request, service, database, order, page, at_most),
     )
 
@@ -216,7 +216,10 @@ def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
         "ra_deg": fields.ra_deg.round(4).tolist(),
         "dec_deg": fields.dec_deg.round(4).tolist(),
         "stars": fields.stars.tolist(),
-        "bins": [{"least": one.least, "colour": one.colour} for one in colour_bins(fields.stars)],
+        "bins": [
+            {"least": colour_bin.least, "colour": colour_bin.colour}
+            for colour_bin in colour_bins(fields.stars)
+        ],
     }
     return JSONResponse(content, headers=CACHED)
 
@@ -232,7 +235,7 @@ def build_report(service: TheService, _: Reader, database_id: str) -> Response:
     head = ENVIRONMENT.get_template("report_head.html").render(database=database)
     page = path.read_bytes().replace(b"<body>", b"<body>" + head.encode(), 1)
     page = _COUNT.sub(
-        lambda found: found[0].replace(b",", "\N{NARROW NO-BREAK SPACE}".encode()), page
+        lambda match: match[0].replace(b",", "\N{NARROW NO-BREAK SPACE}".encode()), page
     )
     return Response(page, media_type="text/html; charset=utf-8", headers=headers)
 
@@ -255,7 +258,7 @@ async def compare(
     if other:
         # It waits its turn like a query, because it reads whole tables.
         sides = await run_in_threadpool(_older_first, service, database_id, other)
-        ids = [one.id for one in sides]
+        ids = [side.id for side in sides]
         difference = await service.query_pool.run(difference_of, service, *ids)
     return await run_in_threadpool(_comparison, request, service, database_id, other, difference)
 
@@ -264,8 +267,8 @@ def _comparison(
     request: Request, service: Service, database_id: str, other: str, difference: Difference | None
 ) -> Response:
     database = service.library.database(database_id)
-    others = [one for one in service.library.databases() if one.id != database.id]
-    others.sort(key=lambda one: one.name != database.name)  # other versions of it first
+    others = [candidate for candidate in service.library.databases() if candidate.id != database.id]
+    others.sort(key=lambda candidate: candidate.name != database.name)  # other versions of it first
     earlier, later = _older_first(service, database_id, other) if other else (database, None)
     code = later and difference_code(page_url(request, service), earlier.id, later.id)
     return render(
@@ -277,7 +280,7 @@ def _comparison(
         earlier=earlier,
         later=later,
         difference=difference,
-        sides=[_side(service, one) for one in (earlier, later)] if later else [],
+        sides=[_side(service, side) for side in (earlier, later)] if later else [],
         notebook=Notebook(f"{earlier.title}-{later.title}", code) if later and code else None,
         changed=CHANGED,
         most=DIFFERENCES_SHOWN,
@@ -287,8 +290,10 @@ def _comparison(
 def _another_version(service: Service, database_id: str) -> str:
     """Return the id of the newest other version of a database; empty if there is none."""
     database = service.library.database(database_id)
-    others = [one for one in service.library.databases() if one.id != database.id]
-    return next((one.id for one in reversed(others) if one.name == database.name), "")
+    others = [candidate for candidate in service.library.databases() if candidate.id != database.id]
+    return next(
+        (candidate.id for candidate in reversed(others) if candidate.name == database.name), ""
+    )
 
 
 def _side(service: Service, database: ListedDatabase) -> dict[str, Any]:

@@ -40,12 +40,12 @@ MAX_CHARACTERS = 12_000
 """Most characters of an address: some servers refuse longer ones."""
 
 
-def design_query(draft: SpecForm, chosen: str, pinned: str = "") -> str | None:
+def design_query(draft: SpecForm, preset_name: str, pinned: str = "") -> str | None:
     """Return the query of the address of a design: empty, or with its question mark.
 
     None if it is too long for an address, for example with a large table of a response.
     """
-    base = chosen if chosen in preset_names() else preset_names()[0]
+    base = preset_name if preset_name in preset_names() else preset_names()[0]
     query = {PRESET: base} if base != preset_names()[0] else {}
     changes = _changes(draft, base)
     query |= {TEXT: draft.text} if changes is None else changes

@@ -106,8 +106,8 @@ def _text(name: str) -> str:
 
 
 def _title(name: str) -> str:
-    found = _TITLE.search(_text(name))
-    return found[1] if found else name
+    match = _TITLE.search(_text(name))
+    return match[1] if match else name
 
 
 @cache
@@ -179,8 +179,8 @@ def _described(name: str) -> str:
     words = inspect.getdoc(thing) or ""
     if inspect.isclass(thing):
         methods = {k: v for k, v in inspect.getmembers(thing, callable) if k[0] != "_"}
-        told = [f"{_signed(k, v)}\n    {_first_line(v)}" for k, v in methods.items()]
-        words += "\n\n" + "\n".join(told) if told else ""
+        lines = [f"{_signed(k, v)}\n    {_first_line(v)}" for k, v in methods.items()]
+        words += "\n\n" + "\n".join(lines) if lines else ""
     head = _signed(name.rpartition(".")[2], thing)
     code = f'<pre tabindex="0"><code>{escape(words)}</code></pre>'
     return f'<h3 class="code"><code>{escape(head)}</code></h3>\n{code}\n'
@@ -202,7 +202,7 @@ def _with_anchors(tokens: list[Token]) -> list[tuple[str, str]]:
     parts = []
     for opening, inline in pairwise(tokens):
         if opening.type == "heading_open":
-            words = "".join(one.content for one in inline.children or ())
+            words = "".join(child.content for child in inline.children or ())
             anchor = re.sub(r"[^\w\- ]", "", words.lower()).strip().replace(" ", "-")
             opening.attrSet("id", anchor)
             if opening.tag == "h2":

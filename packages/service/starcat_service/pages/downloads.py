@@ -76,5 +76,5 @@ def spec(service: TheService, _: Reader, database_id: str) -> Response:
 def _without_none(content: Any) -> Any:
     """Return a content without values that are not given, which TOML cannot express."""
     if isinstance(content, dict):
-        return {key: _without_none(one) for key, one in content.items() if one is not None}
+        return {key: _without_none(value) for key, value in content.items() if value is not None}
     return content

@@ -111,11 +111,11 @@ class SpecForm:
     @property
     def errors(self) -> dict[str, str]:
         """What is wrong by the field that it is said beside; by `TEXT` where there is none."""
-        found: dict[str, str] = {}
+        messages: dict[str, str] = {}
         for error in self.wrong:
             for key, words in self._beside(error).items():
-                found.setdefault(key, words)
-        return found
+                messages.setdefault(key, words)
+        return messages
 
     def field_of(self, key: str | None) -> str | None:
         """Return the field of a key, or the first field of a section; None if there is none."""
@@ -128,9 +128,9 @@ class SpecForm:
         named = [name for name in (*self.values, FILE) if name == key]
         inside = [name for name in self.values if key and name.startswith(f"{key}.")]
         words = str(error).removeprefix(f"{ORIGIN}: ")
-        told = [name for name in inside if name.rpartition(".")[2] in words]
-        told.sort(key=lambda name: words.index(name.rpartition(".")[2]))
-        return {(named or told or [TEXT])[0]: words}
+        mentioned = [name for name in inside if name.rpartition(".")[2] in words]
+        mentioned.sort(key=lambda name: words.index(name.rpartition(".")[2]))
+        return {(named or mentioned or [TEXT])[0]: words}
 
 
 def draft_of_text(text: str) -> SpecForm:
@@ -147,17 +147,17 @@ def draft_of_form(form: Mapping[str, str]) -> SpecForm:
     text = form.get(TEXT, "").replace("\r\n", "\n")
     before = form.get(BEFORE, "").replace("\r\n", "\n")
     is_edited = text.strip() != before.strip()
-    known = draft_of_text(text if is_edited else before)
-    if known.error is not None and known.error.key == TEXT:
-        return _with_fields_of(form, known)
+    draft = draft_of_text(text if is_edited else before)
+    if draft.error is not None and draft.error.key == TEXT:
+        return _with_fields_of(form, draft)
     if is_edited:
-        return _with_own_description(known)
+        return _with_own_description(draft)
     content = content_of_toml(before, ORIGIN)
     try:
         edit = _edit(content, form)
     except ConfigError as error:
         return _draft(content, before, ConfigError(str(error), key=TEXT))
-    return _edited(known, edit)
+    return _edited(draft, edit)
 
 
 def draft_with(draft: SpecForm, changes: Mapping[str, Any]) -> SpecForm:
@@ -173,8 +173,8 @@ def _edited(draft: SpecForm, edit: _Edit) -> SpecForm:
     """Return a draft with the changes of an edit."""
     if not edit.changes:
         return draft
-    found = _draft(edit.content, edit.text(draft.text))
-    return found if "description" in edit.changes else _with_own_description(found)
+    edited = _draft(edit.content, edit.text(draft.text))
+    return edited if "description" in edit.changes else _with_own_description(edited)
 
 
 def _with_own_description(draft: SpecForm) -> SpecForm:
@@ -219,10 +219,10 @@ def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = No
     if error is None:
         try:
             spec = spec_from_dict(dict(content), ORIGIN)
-        except ConfigError as found:
-            wrong = (found,)
-            if isinstance(found.__cause__, ValidationError):
-                wrong = tuple(all_that_is_wrong(found.__cause__, ORIGIN, BuildSpec, "spec"))
+        except ConfigError as refusal:
+            wrong = (refusal,)
+            if isinstance(refusal.__cause__, ValidationError):
+                wrong = tuple(all_that_is_wrong(refusal.__cause__, ORIGIN, BuildSpec, "spec"))
     has_focal = any(value_at(content, key) is not None for key in _OF_LENS["field"])
     source = value_at(content, "catalog.source")
     values = {key: _shown(key, content) for key in FIELDS}
@@ -304,12 +304,12 @@ def _with_empty_lines(text: str, before: str) -> str:
 
     tomlkit puts a key that is new in a table behind the empty line at the end of the table.
     """
-    close = {found[1] for found in _HEAD.finditer(before)}
-    places = [found.start() for found in _HEAD.finditer(text) if found[1] not in close]
-    for place in reversed(places):
-        line = text[text.rfind("\n", 0, place - 1) + 1 : place]
+    close = {head[1] for head in _HEAD.finditer(before)}
+    starts = [head.start() for head in _HEAD.finditer(text) if head[1] not in close]
+    for start in reversed(starts):
+        line = text[text.rfind("\n", 0, start - 1) + 1 : start]
         if not line.startswith("#"):
-            text = f"{text[:place]}\n{text[place:]}"
+            text = f"{text[:start]}\n{text[start:]}"
     return text
 
 

@@ -46,27 +46,30 @@ class FactRow:
 
 def database_rows(service: Service, *databases: ListedDatabase) -> list[FactRow]:
     """Return databases in the form of the list: these, or all."""
-    released = {one.title: one.manifest.sha256 for one in recorded(service.paths.registry)}
+    released = {
+        release.title: release.manifest.sha256 for release in recorded(service.paths.registry)
+    }
     built: dict[str, float] = {}
     for job in service.jobs.all(state="done", most=MAX_JOBS):
-        made = (job.result or {}).get("database")
-        if job.kind == "build" and made and job.ended_s:
-            built[str(made)] = job.ended_s
+        database_id = (job.result or {}).get("database")
+        if job.kind == "build" and database_id and job.ended_s:
+            built[str(database_id)] = job.ended_s
     return [
         FactRow(
-            one,
-            _rates(one),
-            one.title in released and released[one.title] == one.manifest_blob.sha256,
-            built.get(one.id) or (one.folder / MANIFEST_NAME).stat().st_mtime,
+            database,
+            _rates(database),
+            database.title in released
+            and released[database.title] == database.manifest_blob.sha256,
+            built.get(database.id) or (database.folder / MANIFEST_NAME).stat().st_mtime,
         )
-        for one in databases or service.library.databases()
+        for database in databases or service.library.databases()
     ]
 
 
 def _rates(database: ListedDatabase) -> list[Mapping[str, Any]]:
     """Return the rates of the self-test."""
     # A report of an older version has no share of all pointings.
-    return [to_dict(rates_of(one)) for one in readable_report(database).get("self_test", ())]
+    return [to_dict(rates_of(rates)) for rates in readable_report(database).get("self_test", ())]
 
 
 def readable_report(database: ListedDatabase) -> dict[str, Any]:
@@ -95,13 +98,13 @@ def star_fact_columns(manifest: Mapping[str, Any]) -> list[str]:
     """Return the columns of ``stars`` with errors and blends that the database has."""
     spec = manifest["spec"]
     schema = product_schema(*manifest["products"]["stars"]["schema"].rsplit("-", 1))
-    known = ["mag_error", "position_error_end_arcsec"]
+    names = ["mag_error", "position_error_end_arcsec"]
     if not isinstance(spec["epoch_jyear"], int | float):
-        known.append("drift_arcsec")
+        names.append("drift_arcsec")
     if spec["selection"].get("neighbours"):
-        known += ["centroid_offset_arcsec", "contamination", "blend_mag"]
+        names += ["centroid_offset_arcsec", "contamination", "blend_mag"]
     columns = {column.name for column in schema.columns}
-    return [name for name in known if name in columns]
+    return [name for name in names if name in columns]
 
 
 def rejections_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -122,7 +125,7 @@ def rejections_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
             "meaning": words.get(name, ""),
             "query": None if name in NOT_LISTED or name not in words else _ROWS.format(name),
         }
-        for name, count in sorted(counts.items(), key=lambda one: (-one[1], one[0]))
+        for name, count in sorted(counts.items(), key=lambda entry: (-entry[1], entry[0]))
         if count
     ]
 

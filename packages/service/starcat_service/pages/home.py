@@ -33,7 +33,7 @@ def home(request: Request, service: TheService, reader: Reader) -> Response:
         "home.html",
         rows=newest_first[:SHOWN],
         count=len(rows),
-        releases=sorted(releases, key=lambda one: -(one.published_s or 0.0))[:SHOWN],
+        releases=sorted(releases, key=lambda release: -(release.published_s or 0.0))[:SHOWN],
         release_count=len(releases),
         jobs=[job for job in jobs if job.state not in ENDED],
         address=page_url(request, service),
@@ -85,15 +85,15 @@ def sign_in(
 ) -> Response:
     """Begin a session, if the token is valid."""
     identities: Identities = request.app.state.identities
-    found = identities.of_token(token.strip())
-    if found is None:
+    valid_token = identities.of_token(token.strip())
+    if valid_token is None:
         wait_s = identities.guessed.take(network_of(request_limits.client_ip(request.scope)))
         form = sign_in_form(request, next_address, NOT_VALID, 429 if wait_s else 401)
         form.headers.update(request_limits.later(wait_s) if wait_s else {})
         return form
     answer = RedirectResponse(own_path(next_address), 303)
     answer.set_cookie(
-        value=identities.sessions.open(found),
+        value=identities.sessions.open(valid_token),
         max_age=round(service.settings.session_hours * 3600),
         **_cookie(service.settings),
     )
@@ -130,12 +130,12 @@ def interface(request: Request, reader: Reader) -> Response:
                     "method": method.upper(),
                     "path": path,
                     "parameters": [
-                        (one["name"], one["in"], one.get("description", ""))
-                        for one in operation.get("parameters", ())
+                        (parameter["name"], parameter["in"], parameter.get("description", ""))
+                        for parameter in operation.get("parameters", ())
                     ],
                     "answers": [
-                        (status, one["description"])
-                        for status, one in sorted(operation["responses"].items())
+                        (status, response["description"])
+                        for status, response in sorted(operation["responses"].items())
                     ],
                 }
             )

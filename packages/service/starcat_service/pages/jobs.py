@@ -101,11 +101,11 @@ def job_page(request: Request, service: TheService, who: Reader, job_id: str) ->
 
 def evaluation_of(job: Job | None) -> dict[str, Any]:
     """Return the rates of an evaluation that pages show, and its curves if they are drawn."""
-    found = (job and job.result) or {}
+    result = (job and job.result) or {}
     return {
         # A job of an older version has recorded no share of all pointings.
-        "rates": [to_dict(rates_of(one)) for one in found.get("rates", ())],
-        "charts": charts_of(found),
+        "rates": [to_dict(rates_of(rates)) for rates in result.get("rates", ())],
+        "charts": charts_of(result),
         "chart": (CHART_WIDTH, CHART_HEIGHT),
     }
 
@@ -165,7 +165,7 @@ class Mark:
     low_y: float  # ends of the interval
     high_y: float
     value: float  # value of the quantity
-    told: Mapping[str, Any]  # the share
+    point: Mapping[str, Any]  # the share
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class Chart:
     """A drawn curve, up to 100 %."""
 
     label: str
-    held: str  # values of the other quantities; empty if they are the usual ones
+    conditions: str  # values of the other quantities; empty if they are the usual ones
     marks: list[Mark]
     ticks: list[tuple[float, float]]  # percent, and its position
 
@@ -228,11 +228,11 @@ def steps_of(job: Job, events: Sequence[Event]) -> list[dict[str, str]]:
     reached = max((k for k, (_, words) in enumerate(steps) if seen & set(words)), default=-1)
     if job.state == "running":
         reached = max(reached, 0)
-    found = []
+    shown_steps = []
     for k, (name, words) in enumerate(steps):
         state = "done" if job.state == "done" or k < reached else "open"
         if k == reached and job.state != "done":
             state = "current" if job.state == "running" else "failed"
         state = "open" if job.state == "queued" else state
-        found.append({"name": name, "words": " ".join(words), "state": state})
-    return found
+        shown_steps.append({"name": name, "words": " ".join(words), "state": state})
+    return shown_steps

@@ -104,9 +104,9 @@ async def sent_form(request: Request, service: TheService) -> AsyncIterator[Sent
         file, content = form.get(FILE), None
         if isinstance(file, UploadFile) and file.filename:
             content = (file.filename, await file.read(MAX_BYTES + 1))
-        uploads = [one for one in form.getlist(PHOTOS) if isinstance(one, UploadFile)]
+        uploads = [upload for upload in form.getlist(PHOTOS) if isinstance(upload, UploadFile)]
         most_mib = service.settings.upload_mib
-        photos = [FrameUpload.of_form(one, most_mib) for one in uploads if one.filename]
+        photos = [FrameUpload.of_form(upload, most_mib) for upload in uploads if upload.filename]
         yield Sent(fields, content, photos)
 
 
@@ -118,7 +118,7 @@ def new_page(
     request: Request,
     service: TheService,
     _: Reader,
-    chosen: Annotated[str, Query(alias=PRESET)] = "",
+    preset_name: Annotated[str, Query(alias=PRESET)] = "",
     pinned: Annotated[str, Query()] = "",
     job: Annotated[str | None, Query()] = None,
     database: Annotated[str | None, Query()] = None,
@@ -129,9 +129,9 @@ def new_page(
     else:
         draft = draft_of_content(without_defaults(_spec_of(service, job, database)))
     # The page does not wait for a catalog; its script requests the estimate.
-    form = {PRESET: chosen or preset_names()[0], PINNED: pinned}
-    found = _first(service, draft, form)
-    return _rendered(request, service, draft, form, found, is_first=True)
+    form = {PRESET: preset_name or preset_names()[0], PINNED: pinned}
+    shown = _first(service, draft, form)
+    return _rendered(request, service, draft, form, shown, is_first=True)
 
 
 def _spec_of(service: Service, job: str | None, database: str | None) -> dict[str, Any]:
@@ -146,23 +146,23 @@ def _spec_of(service: Service, job: str | None, database: str | None) -> dict[st
 @router.post("/new")
 async def sent_page(request: Request, service: TheService, sent: Form, _: Reader) -> Response:
     """Build what the form has, sign in for it, or show what it would give."""
-    form, wanted = sent.fields, sent.fields.get("do", "")
-    if wanted == "sign-in":
+    form, action = sent.fields, sent.fields.get("do", "")
+    if action == "sign-in":
         return await service.designs.run(WAIT_S, partial(_sign_in, request, service, form))
     change = await _asked(service, sent)
     draft = change.draft
-    if not wanted.startswith("build") or draft.spec is None or draft.wrong:
+    if not action.startswith("build") or draft.spec is None or draft.wrong:
         return await _page(request, service, change, form)
     who = principal_of(request)
     if who.role < Role.BUILDER:
         words = "building needs the role builder; sign in with a token that has it"
         return await _page(request, service, change, form, page_problem(Problem(403, words)))
-    if wanted != BUILD_ANYWAY:
+    if action != BUILD_ANYWAY:
         seen = await _estimated(service, draft)
-        found = await service.designs.run(WAIT_S, partial(_shown, service, draft, form, [], seen))
-        if found["is_busy"] or not found["can_build"]:
-            asks = Problem(409, ASKS) if found["is_busy"] else None
-            refused = asks or Problem(422, found["summary"].partition(": ")[2])
+        shown = await service.designs.run(WAIT_S, partial(_shown, service, draft, form, [], seen))
+        if shown["is_busy"] or not shown["can_build"]:
+            asks = Problem(409, ASKS) if shown["is_busy"] else None
+            refused = asks or Problem(422, shown["summary"].partition(": ")[2])
             return await _page(request, service, change, form, page_problem(refused))
     try:
         submitted = await service.designs.run(
@@ -176,23 +176,23 @@ async def sent_page(request: Request, service: TheService, sent: Form, _: Reader
 def _sign_in(request: Request, service: Service, form: dict[str, str]) -> Response:
     """Go to the sign-in, which comes back to the design of a form."""
     draft = draft_of_form(form)
-    found = sign_in_address(_address(draft, form))
-    if len(found) <= MAX_TARGET_BYTES and found != sign_in_address(""):
-        return RedirectResponse(found, 303)
+    target = sign_in_address(_address(draft, form))
+    if len(target) <= MAX_TARGET_BYTES and target != sign_in_address(""):
+        return RedirectResponse(target, 303)
     words = (
         "This design is too long for an address, and would be lost. Copy its text, sign in, and "
         "paste it there."
     )
     return _rendered(
-        request, service, draft, form, _first(service, draft, form) | {"told": [words]}
+        request, service, draft, form, _first(service, draft, form) | {"remarks": [words]}
     )
 
 
 @router.post("/new/address")
 def address(sent: Form, _: Reader) -> Response:
     """Tell a script the address of a design at once: its estimate can take long."""
-    found = _address(draft_of_form(sent.fields), sent.fields)
-    return JSONResponse({"address": found}, headers={"Cache-Control": "no-store"})
+    design_address = _address(draft_of_form(sent.fields), sent.fields)
+    return JSONResponse({"address": design_address}, headers={"Cache-Control": "no-store"})
 
 
 @router.post("/new/preview")
@@ -205,7 +205,7 @@ async def preview(service: TheService, sent: Form, _: Reader) -> Response:
 
 def _state(service: Service, change: NewDesign, form: dict[str, str], seen: Seen) -> Response:
     draft = change.draft
-    found = _shown(service, draft, form, change.told, seen) | {"job": change.job}
+    shown = _shown(service, draft, form, change.remarks, seen) | {"job": change.job}
     content: dict[str, Any] = {
         "toml": draft.text,
         "values": draft.values,
@@ -213,14 +213,14 @@ def _state(service: Service, change: NewDesign, form: dict[str, str], seen: Seen
         "products": draft.products,
         "bands": draft.bands,
         "responses": draft.responses,
-        **{name: found[name] for name in ("errors", "summary", "address", "pinned_query", "job")},
-        "wrong": ENVIRONMENT.get_template("new_wrong.html").render(found),
-        "result": ENVIRONMENT.get_template("new_result.html").render(found),
-        "is_busy": found["is_busy"],
-        "is_known": found["preview"] is not None,
-        "can_build": found["can_build"],
-        "stars": _counts(found["preview"]),
-        "region_tiling": _region_tiling(found["preview"]),
+        **{name: shown[name] for name in ("errors", "summary", "address", "pinned_query", "job")},
+        "wrong": ENVIRONMENT.get_template("new_wrong.html").render(shown),
+        "result": ENVIRONMENT.get_template("new_result.html").render(shown),
+        "is_busy": shown["is_busy"],
+        "is_known": shown["preview"] is not None,
+        "can_build": shown["can_build"],
+        "stars": _counts(shown["preview"]),
+        "region_tiling": _region_tiling(shown["preview"]),
     }
     return JSONResponse(content, headers={"Cache-Control": "no-store"})
 
@@ -238,7 +238,7 @@ class NewDesign:
     """The design that a form asks for."""
 
     draft: SpecForm
-    told: list[str]  # remarks for people
+    remarks: list[str]  # remarks for people
     job: str | None = None  # job that has to end before the form is sent again
 
 
@@ -281,21 +281,21 @@ async def design_of_photos(service: Service, photos: list[FrameUpload]) -> NewDe
         raise Problem(422, f"{len(photos)} photographs were given; choose 1 to {MAX_PHOTOS}")
     async with service.photographs.turn(WAIT_S):
         blind = await in_thread(partial(photographs_database, service))
-        found = await service.sandbox.run(_camera_of, service, photos, blind)
-    camera = CameraSpec.model_validate(found["camera"])
-    starter = await service.catalogs.starter("camera", camera, reach_mag=found["reach_mag"])
-    return await service.designs.run(WAIT_S, partial(_design_of_camera, found, starter.spec))
+        measured = await service.sandbox.run(_camera_of, service, photos, blind)
+    camera = CameraSpec.model_validate(measured["camera"])
+    starter = await service.catalogs.starter("camera", camera, reach_mag=measured["reach_mag"])
+    return await service.designs.run(WAIT_S, partial(_design_of_camera, measured, starter.spec))
 
 
-def _design_of_camera(found: dict[str, Any], first: BuildSpec) -> NewDesign:
+def _design_of_camera(measured: dict[str, Any], first: BuildSpec) -> NewDesign:
     """Return the design for what was measured in photographs, from a first spec."""
     from starcat.pipeline import spec_of_photos
 
-    spec, remark = spec_of_photos(first, found["noise_px"], found["reach_mag"])
-    remarks = "".join(f"# {line}\n" for line in (*found["remarks"], remark))
+    spec, remark = spec_of_photos(first, measured["noise_px"], measured["reach_mag"])
+    remarks = "".join(f"# {line}\n" for line in (*measured["remarks"], remark))
     text = draft_of_content(without_defaults(spec.recorded())).text
     words = "Comments in the text of the spec have the uncertainty of each value."
-    return NewDesign(draft_of_text(remarks + text), [f"{found['remarks'][0]} {words}"])
+    return NewDesign(draft_of_text(remarks + text), [f"{measured['remarks'][0]} {words}"])
 
 
 def _camera_of(service: Service, photos: list[FrameUpload], blind: Path) -> dict[str, Any]:
@@ -306,8 +306,8 @@ def _camera_of(service: Service, photos: list[FrameUpload], blind: Path) -> dict
             names.append(f"{number}-{photo.name}" if photo.name in names else photo.name)
             photo.write_to(folder / names[-1], service)
         arguments = {"folder": str(folder), "files": names, "blind": str(blind)}
-        found: dict[str, Any] = service.sandbox.call("first_camera", arguments)
-        return found
+        measured: dict[str, Any] = service.sandbox.call("first_camera", arguments)
+        return measured
 
 
 async def suggested(service: Service, draft: SpecForm) -> NewDesign:
@@ -319,8 +319,8 @@ async def suggested(service: Service, draft: SpecForm) -> NewDesign:
         return NewDesign(draft, [words])
     starter = await service.catalogs.starter("camera", camera)
     limit = starter.spec.selection.faint_limit_mag
-    own = draft.spec and (draft.spec.catalog.source, draft.spec.camera.response.name)
-    if draft.spec is not None and own != (starter.spec.catalog.source, None):
+    source_response = draft.spec and (draft.spec.catalog.source, draft.spec.camera.response.name)
+    if draft.spec is not None and source_response != (starter.spec.catalog.source, None):
         limit, _ = await service.catalogs.enough_limit(draft.spec)
     selection, boresights = starter.spec.selection, starter.spec.boresights
     changes: dict[str, Any] = {
@@ -334,32 +334,32 @@ async def suggested(service: Service, draft: SpecForm) -> NewDesign:
     for name in USUAL_PRODUCTS:
         changes[f"products.{name}.enabled"] = False if name in starter.left_out else None
     fov = camera.camera()
-    told = (
+    summary = (
         f"For {fov.fov_x_deg:.4g} x {fov.fov_y_deg:.4g} deg: faint limit {limit:g}, the "
         f"{selection.max_stars_per_field} brightest of each field, "
         f"{count_text(boresights.count)} boresights."
     )
-    advice = [f"{one}." for one in starter.figures.advice]
-    return NewDesign(draft_with(draft, changes), [told, *advice])
+    advice = [f"{sentence}." for sentence in starter.figures.advice]
+    return NewDesign(draft_with(draft, changes), [summary, *advice])
 
 
 @dataclass(frozen=True)
 class Seen:
     """The estimates that a page shows: of its design, and of the design that is pinned."""
 
-    own: tuple[Estimate, Verdict] | None = None
+    estimated: tuple[Estimate, Verdict] | None = None
     problem: ProblemDetails | None = None  # why there is none
     pinned: tuple[Estimate, Verdict] | None = None
 
 
 async def _estimated(service: Service, draft: SpecForm, form: Mapping[str, str] = {}) -> Seen:
     """Return the estimates for a page."""
-    own, problem = await _estimate(service, draft)
+    estimated, problem = await _estimate(service, draft)
     pinned = None
     if form.get(PINNED):
         with suppress(StarcatError):
             pinned, _ = await _estimate(service, pinned_draft(form[PINNED]))
-    return Seen(own, problem, pinned)
+    return Seen(estimated, problem, pinned)
 
 
 async def _estimate(
@@ -368,8 +368,8 @@ async def _estimate(
     if draft.spec is None:
         return None, None
     try:
-        found = await service.catalogs.estimate(draft.spec)
-        return (found, await verdict_of(found, service.catalogs)), None
+        estimate = await service.catalogs.estimate(draft.spec)
+        return (estimate, await verdict_of(estimate, service.catalogs)), None
     except SourceMissing as error:
         return None, page_problem(error).model_copy(update={"key": "catalog.source"})
     except (StarcatError, Problem) as error:
@@ -377,18 +377,18 @@ async def _estimate(
 
 
 def _shown(
-    service: Service, draft: SpecForm, form: dict[str, str], told: list[str], estimates: Seen
+    service: Service, draft: SpecForm, form: dict[str, str], remarks: list[str], estimates: Seen
 ) -> dict[str, Any]:
     """Return what page and script are told of a design and of what it would give."""
     errors, problem = dict(draft.errors), None
-    seen = None if estimates.own is None else preview_of(*estimates.own)
-    found = estimates.problem
-    if found is not None:
-        field = draft.field_of(found.key)
-        if field is None or found.status == 503:
-            problem = found
+    seen = None if estimates.estimated is None else preview_of(*estimates.estimated)
+    failure = estimates.problem
+    if failure is not None:
+        field = draft.field_of(failure.key)
+        if field is None or failure.status == 503:
+            problem = failure
         else:
-            errors[field] = found.detail
+            errors[field] = failure.detail
     if draft.spec is not None:
         errors |= _taken(service, draft)
     refusals = []
@@ -405,7 +405,7 @@ def _shown(
         "problem": problem and problem.detail,
         "errors": errors,
         "refusals": refusals,
-        "told": told,
+        "remarks": remarks,
         "summary": _summary(seen, [*errors.values(), *refusals], problem),
         "is_busy": is_busy,
         "can_build": not errors and not is_refused and (problem is None or is_busy),
@@ -421,7 +421,7 @@ def _first(service: Service, draft: SpecForm, form: dict[str, str]) -> dict[str,
     return {
         **dict.fromkeys(("preview", "pinned", "problem", "job")),
         "errors": errors,
-        "told": [],
+        "remarks": [],
         "differing": [],
         "summary": "",
         "can_build": not errors,
@@ -488,8 +488,8 @@ async def _page(
     seen, draft = await _estimated(service, change.draft, form), change.draft
 
     def make() -> Response:
-        found = _shown(service, draft, form, change.told, seen) | {"job": change.job}
-        return _rendered(request, service, draft, form, found, refused)
+        shown = _shown(service, draft, form, change.remarks, seen) | {"job": change.job}
+        return _rendered(request, service, draft, form, shown, refused)
 
     return await service.designs.run(WAIT_S, make)
 
@@ -499,20 +499,20 @@ def _rendered(
     service: Service,
     draft: SpecForm,
     form: dict[str, str],
-    found: dict[str, Any],
+    shown: dict[str, Any],
     refused: ProblemDetails | None = None,
     *,
     is_first: bool = False,
 ) -> Response:
     if refused is not None and refused.key in draft.values:
-        found["errors"][refused.key] = refused.detail
+        shown["errors"][refused.key] = refused.detail
         refused = None
-    status = refused.status if refused else 422 if found["errors"] and not is_first else 200
+    status = refused.status if refused else 422 if shown["errors"] and not is_first else 200
     return render(
         request,
         "new.html",
         status=status,
-        **found,
+        **shown,
         draft=draft,
         refused=refused and refused.detail,
         is_first=is_first,
@@ -521,13 +521,13 @@ def _rendered(
         presets=_presets(),
         photo_suffixes=",".join(IMAGE_SUFFIXES),
         most_photos=MAX_PHOTOS,
-        chosen=form.get(PRESET, ""),
-        sign_in=sign_in_address(str(found["address"]) or "/new"),
+        preset=form.get(PRESET, ""),
+        sign_in=sign_in_address(str(shown["address"]) or "/new"),
         anyway=BUILD_ANYWAY,
         response_per=form.get(PER, ""),
         sources=_sources(service),
         may_build=principal_of(request).role >= Role.BUILDER,
-        text_error=found["errors"].get(TEXT),
+        text_error=shown["errors"].get(TEXT),
     )
 
 
@@ -539,28 +539,30 @@ def _summary(seen: Preview | None, wrong: list[str], problem: ProblemDetails | N
         return f"Cannot be built: {wrong[0]}"
     if seen.verdict.will_fail:
         return f"Not to be built: {seen.verdict.words}"
-    found = seen.figures
-    stars = found.fields.stars
+    figures = seen.figures
+    stars = figures.fields.stars
     return (
-        f"{count_text(found.guide_stars)} guide stars, {stars.minimum} to {stars.maximum} in a "
-        f"field (median {count_text(stars.median)}), {size_text(found.total_bytes)}"
+        f"{count_text(figures.guide_stars)} guide stars, {stars.minimum} to {stars.maximum} in a "
+        f"field (median {count_text(stars.median)}), {size_text(figures.total_bytes)}"
     )
 
 
 def _presets() -> list[tuple[str, str, list[str]]]:
     """Return name, description, and the catalogs whose files are missing, of the presets."""
-    found = []
+    presets = []
     for name in preset_names():
         spec = preset(name)
         missing = [source for source in spec.sources if not is_here(source)]
-        found.append((name, spec.description, missing))
-    return found
+        presets.append((name, spec.description, missing))
+    return presets
 
 
 def _sources(service: Service) -> list[tuple[str, str]]:
     """Return the star catalogs there are, those whose files are here first."""
-    found = []
-    for one in service.catalogs.offered():
-        told = data_source(one.name).identifier if one.is_here else "its files are not here"
-        found.append((one.name, f"{one.name} – {told}"))
-    return found
+    sources = []
+    for catalog in service.catalogs.offered():
+        title = (
+            data_source(catalog.name).identifier if catalog.is_here else "its files are not here"
+        )
+        sources.append((catalog.name, f"{catalog.name} – {title}"))
+    return sources

@@ -62,10 +62,10 @@ def query_code(
 ) -> str:
     """Return Python that runs an SQL query."""
     text = query.strip().replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
-    given = f", {dict(values)!r}" if values else ""
+    arguments = f", {dict(values)!r}" if values else ""
     return (
         _begun(address) + f'query = """\n{text}\n"""\n'
-        f"answer = service.sql({targets!r}, query{given}, max_rows={most})\n"
+        f"answer = service.sql({targets!r}, query{arguments}, max_rows={most})\n"
         'print(*(column["name"] for column in answer["columns"]), sep="\\t")\n'
         'for row in answer["rows"]:\n    print(*row, sep="\\t")\n'
     )

@@ -42,18 +42,18 @@ def plan_page(request: Request, service: TheService, _: Reader, database: str = 
 async def plan_form(request: Request, service: TheService, _: Reader) -> Response:
     """Plan the attitudes of a form, and show the form again with the plan."""
     async with request.form(max_files=2, max_fields=20) as form:
-        given = {name: str(form.get(name) or "") for name in FIELDS}
+        fields = {name: str(form.get(name) or "") for name in FIELDS}
         try:
-            texts = await _texts(form, given)
-            answer = await service.sandbox.run(_plan, service, given, texts)
+            texts = await _texts(form, fields)
+            answer = await service.sandbox.run(_plan, service, fields, texts)
         except (StarcatError, Problem) as error:
             answer = {"problem": page_problem(error)}
-    return await run_in_threadpool(_page, request, service, given, **answer)
+    return await run_in_threadpool(_page, request, service, fields, **answer)
 
 
-async def _texts(form: FormData, given: dict[str, str]) -> dict[str, bytes]:
+async def _texts(form: FormData, fields: dict[str, str]) -> dict[str, bytes]:
     """Return the tables that a form brings, by the names that messages call them."""
-    texts = {"attitudes": given["attitudes"].strip().encode()}
+    texts = {"attitudes": fields["attitudes"].strip().encode()}
     for name, field in (("attitudes", "file"), ("orbit", "orbit")):
         upload = form.get(field)
         if isinstance(upload, UploadFile) and upload.filename:
@@ -70,11 +70,11 @@ async def _texts(form: FormData, given: dict[str, str]) -> dict[str, bytes]:
     return texts
 
 
-def _plan(service: Service, given: dict[str, str], texts: dict[str, bytes]) -> dict[str, Any]:
-    expected: dict[str, Any] = {name: typed_number(given[name], name) for name in NUMBERS}
-    angles = {name: typed_number(given[f"keep_out.{name}"], f"keep_out.{name}") for name in BODIES}
+def _plan(service: Service, fields: dict[str, str], texts: dict[str, bytes]) -> dict[str, Any]:
+    expected: dict[str, Any] = {name: typed_number(fields[name], name) for name in NUMBERS}
+    angles = {name: typed_number(fields[f"keep_out.{name}"], f"keep_out.{name}") for name in BODIES}
     expected["keep_out_deg"] = {name: angle for name, angle in angles.items() if angle is not None}
-    database = service.library.database(given["database"])
+    database = service.library.database(fields["database"])
     with scratch_folder(service.paths) as folder:
         for name, text in texts.items():
             (folder / name).write_bytes(text)
@@ -95,21 +95,21 @@ def _plan(service: Service, given: dict[str, str], texts: dict[str, bytes]) -> d
         "bodies_seen": [
             name
             for name in BODIES
-            if any(one["angles_deg"].get(name) is not None for one in plan["attitudes"])
+            if any(attitude["angles_deg"].get(name) is not None for attitude in plan["attitudes"])
         ],
         "picture": f"data:image/svg+xml;base64,{picture}",
         "json": f"data:application/json;base64,{whole}",
     }
 
 
-def _page(request: Request, service: Service, given: dict[str, str], **answer: Any) -> Response:
+def _page(request: Request, service: Service, fields: dict[str, str], **answer: Any) -> Response:
     problem = answer.get("problem")
     return render(
         request,
         "plan.html",
         status=problem.status if problem else 200,
-        databases=[(one.id, one.title) for one in service.library.databases()],
-        given=given,
+        databases=[(database.id, database.title) for database in service.library.databases()],
+        fields=fields,
         bodies=BODIES,
         errors={problem.key: problem.detail} if problem and problem.key else {},
         most_lines=MAX_PLAN_LINES,

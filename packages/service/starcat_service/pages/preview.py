@@ -83,14 +83,14 @@ def preview_of(estimate: Estimate, verdict: Verdict) -> Preview:
     )
 
 
-async def verdict_of(found: Estimate, catalogs: ChildCatalogs) -> Verdict:
+async def verdict_of(estimate: Estimate, catalogs: ChildCatalogs) -> Verdict:
     """Return whether nearly every field has the stars that it needs, and what to do if not."""
-    blind, stars = 1.0 - found.enough_share, found.coverage.stars
-    spec = found.spec
+    blind, stars = 1.0 - estimate.enough_share, estimate.coverage.stars
+    spec = estimate.spec
     if blind > BLIND_SHARE:
         words = f"{_percent(blind)} of the sky is blind: a frame there has fewer than 4 guide stars"
         advice, test = await _advice(spec, catalogs), spec.self_test
-        hits = round(found.enough_share * test.frames)
+        hits = round(estimate.enough_share * test.frames)
         if wilson_interval(hits, test.frames)[1] >= test.min_identified:
             return Verdict("bad", f"{words}. {advice}")
         needed = _percent(test.min_identified)
@@ -114,16 +114,16 @@ async def verdict_of(found: Estimate, catalogs: ChildCatalogs) -> Verdict:
 
 async def _advice(spec: BuildSpec, catalogs: ChildCatalogs) -> str:
     limit, deepest = await catalogs.enough_limit(spec)
-    own = spec.selection.faint_limit_mag
-    if limit > own + 0.04:
+    spec_limit = spec.selection.faint_limit_mag
+    if limit > spec_limit + 0.04:
         ends = limit >= deepest - 0.1
         more = f", where the catalog ends, or take {_OTHERS}" if ends else ""
         return f"Set the faint limit to {_band(spec)} {limit:.1f}{more}."
-    if own >= deepest - 0.1:
+    if spec_limit >= deepest - 0.1:
         return f"The catalog ends at {_band(spec)} {deepest:.1f}: take {_OTHERS}."
     return (
-        f"{_band(spec)} {own:g} is faint enough: the other rules remove the stars. See below which "
-        "of them does, or let limits be suggested."
+        f"{_band(spec)} {spec_limit:g} is faint enough: the other rules remove the stars. See "
+        "below which of them does, or let limits be suggested."
     )
 
 
@@ -151,7 +151,9 @@ def _bars(counts: Counts) -> list[Bar]:
     fields = np.bincount((counts - least) // step)
     bars = []
     for low, count in zip(range(least, most + 1, step), fields.tolist(), strict=True):
-        colour = next(one.name for one in reversed(FIXED_BINS) if one.least <= low)
+        colour = next(
+            colour_bin.name for colour_bin in reversed(FIXED_BINS) if colour_bin.least <= low
+        )
         bars.append(Bar(low, low + step - 1, count, colour))
     return bars
 

@@ -46,13 +46,13 @@ async def publish_page(
     confirmed: Annotated[bool, Form()] = False,
 ) -> Response:
     """Ask for confirmation to publish a database, or publish it and show it."""
-    wanted = api.ToPublish(database=database, note=note.replace("\r\n", "\n").strip())
+    publication = api.ToPublish(database=database, note=note.replace("\r\n", "\n").strip())
     if not confirmed:
         asked = service.library.database(database)
         show = partial(_page, request, service, publisher, database=database)
-        return await run_in_threadpool(show, note=wanted.note, asked=asked)
+        return await run_in_threadpool(show, note=publication.note, asked=asked)
     try:
-        released = await api.publish(wanted, Response(), service, publisher)
+        released = await api.publish(publication, Response(), service, publisher)
     except (StarcatError, Problem) as error:
         problem = problem_of(error)
         show = partial(_page, request, service, publisher, database=database)
@@ -74,16 +74,16 @@ def _page(
     asked: ListedDatabase | None = None,
 ) -> Response:
     listed = api.all_releases(service, principal).releases
-    found = [one for one in listed if _has_words(one, q)]
+    releases = [release for release in listed if _has_words(release, q)]
     if order != "name":
         by = "bytes" if order == "size" else "published_s"
-        found.sort(key=lambda one: getattr(one, by) or 0.0, reverse=True)
+        releases.sort(key=lambda release: getattr(release, by) or 0.0, reverse=True)
     rows = database_rows(service)
     return render(
         request,
         "releases.html",
         status=problem.status if problem else 200,
-        releases=found,
+        releases=releases,
         count=len(listed),
         q=q,
         order=order,
@@ -99,12 +99,12 @@ def _page(
         most_note=api.MAX_NOTE,
         database=database,
         note=note,
-        published=published if published in {one.title for one in listed} else "",
+        published=published if published in {release.title for release in listed} else "",
         problem=problem,
     )
 
 
 def _has_words(release: api.ReleaseFacts, text: str) -> bool:
     """Return whether a release has all words of a text."""
-    told = f"{release.title} {release.owner or ''} {release.note or ''}".lower()
-    return all(word in told for word in text.lower().split())
+    words = f"{release.title} {release.owner or ''} {release.note or ''}".lower()
+    return all(word in words for word in text.lower().split())

@@ -24,13 +24,13 @@ _OTHERS = ("file", "optics_file", "optics_wavelength_nm", "optics_transmission")
 _LATER = ("photometry", "zero_point")
 
 
-def responses_of(own: str) -> list[tuple[str, str]]:
+def responses_of(current: str) -> list[tuple[str, str]]:
     """Return name and text of the responses that a design may choose from, its own one included."""
-    found = [("", "the catalog's band")]
-    found += [(name, f"{name}: {shipped(name).title}") for name in shipped_names()]
-    if own and own not in shipped_names():
-        found.append((own, f"{own[:60]}: from a file"))
-    return found
+    responses = [("", "the catalog's band")]
+    responses += [(name, f"{name}: {shipped(name).title}") for name in shipped_names()]
+    if current and current not in shipped_names():
+        responses.append((current, f"{current[:60]}: from a file"))
+    return responses
 
 
 def keys_of_another(content: Mapping[str, Any], name: str) -> dict[str, None]:
@@ -48,21 +48,23 @@ def keys_of_file(filename: str, content: bytes, per: str) -> dict[str, Any]:
             raise ConfigError(f"it has more than {MAX_BYTES:,} bytes")
         text = content.decode("utf-8-sig")
         try:
-            made = response_from_text(name, text, None)
+            response = response_from_text(name, text, None)
         except ConfigError as error:
             if error.key != "per" or per not in ("photon", "energy"):
                 raise
-            made = response_from_text(name, text, "photon" if per == "photon" else "energy")
-        if len(made.value) > MAX_ROWS:
-            raise ConfigError(f"it has {len(made.value):,} rows, and a spec {MAX_ROWS:,} at most")
+            response = response_from_text(name, text, "photon" if per == "photon" else "energy")
+        if len(response.value) > MAX_ROWS:
+            raise ConfigError(
+                f"it has {len(response.value):,} rows, and a spec {MAX_ROWS:,} at most"
+            )
     except (ConfigError, UnicodeDecodeError) as error:
-        told = str(error)
+        message = str(error)
         if isinstance(error, UnicodeDecodeError):
-            told = "it is no text; give a CSV file of two columns, wavelength in nm and response"
-        raise ConfigError(f"{PurePath(filename).name[:60]}: {told}", key=FILE) from error
-    table = {"wavelength_nm": made.wavelength_nm.tolist(), "value": made.value.tolist()}
-    found = {"name": name, "per": made.counts, **table}
-    return {f"camera.response.{key}": value for key, value in found.items()}
+            message = "it is no text; give a CSV file of two columns, wavelength in nm and response"
+        raise ConfigError(f"{PurePath(filename).name[:60]}: {message}", key=FILE) from error
+    table = {"wavelength_nm": response.wavelength_nm.tolist(), "value": response.value.tolist()}
+    keys = {"name": name, "per": response.counts, **table}
+    return {f"camera.response.{key}": value for key, value in keys.items()}
 
 
 def _name(filename: str) -> str:

@@ -33,7 +33,7 @@ VIZIER = "https://vizier.cds.unistra.fr/viz-bin/VizieR"
 _CDS = re.compile(r"CDS ([IVXB]+/\w+)")
 
 _PART = """(SELECT '{kind}' AS kind, {reason} AS reason, star_id, designation, mag, ra_deg, dec_deg
-FROM {rows} WHERE mag IS NOT NULL AND ra_deg IS NOT NULL AND {wanted}
+FROM {rows} WHERE mag IS NOT NULL AND ra_deg IS NOT NULL AND {condition}
 ORDER BY mag, star_id LIMIT {most})"""
 _KINDS = (
     ("guide", "stars", "NULL", "true"),
@@ -77,10 +77,10 @@ async def stars_of_view(
     faint: bool = False,
 ) -> Response:
     """Return the brightest stars of a part of the sky; rejected stars have their reason."""
-    found = await service.query_pool.run(
+    stars = await service.query_pool.run(
         _stars, service, service.library.database(database_id), (ra, dec, radius), faint
     )
-    return JSONResponse({"stars": [one.as_dict() for one in found]}, headers=CACHED)
+    return JSONResponse({"stars": [star.as_dict() for star in stars]}, headers=CACHED)
 
 
 def _stars(
@@ -92,10 +92,10 @@ def _stars(
             kind=kind,
             reason=reason,
             rows=table if is_all else f"cone($ra, $dec, $radius, of := '{table}')",
-            wanted=wanted,
+            condition=condition,
             most=MOST,
         )
-        for kind, table, reason, wanted in _KINDS
+        for kind, table, reason, condition in _KINDS
         if table in database.products and (faint or kind != "faint")
     ]
     values = {} if is_all else dict(zip(("ra", "dec", "radius"), where, strict=True))
@@ -129,20 +129,20 @@ def _cds_catalog(source: str) -> str:
     if source == "gaia":  # the embedded sky is an excerpt of it
         return "I/355/gaiadr3"
     try:
-        found = _CDS.search(data_source(source).identifier)
+        match = _CDS.search(data_source(source).identifier)
     except ConfigError:
         return ""
-    return found[1] if found else ""
+    return match[1] if match else ""
 
 
 NAMED_TO_MAG = 8.5  # stars fainter than this have no name of their own
 
 
 def _named(stars: list[SkyStar], epoch_jyear: float) -> list[SkyStar]:
-    bright = [one for one in stars if one.mag is not None and one.mag <= NAMED_TO_MAG]
-    names = star_names_of([vars(one) for one in bright], epoch_jyear)
-    known = {one.id: name for one, name in zip(bright, names, strict=True)}
-    return [replace(one, name=known.get(one.id)) for one in stars]
+    bright = [star for star in stars if star.mag is not None and star.mag <= NAMED_TO_MAG]
+    names = star_names_of([vars(star) for star in bright], epoch_jyear)
+    names_by_id = {star.id: name for star, name in zip(bright, names, strict=True)}
+    return [replace(star, name=names_by_id.get(star.id)) for star in stars]
 
 
 def star_names_of(stars: Sequence[Mapping[str, Any]], epoch_jyear: float) -> list[str | None]:
@@ -150,12 +150,12 @@ def star_names_of(stars: Sequence[Mapping[str, Any]], epoch_jyear: float) -> lis
     if not stars:
         return []
     ra, dec, mag = (
-        np.array([one[name] for one in stars], dtype=np.float64)
+        np.array([star[name] for star in stars], dtype=np.float64)
         for name in ("ra_deg", "dec_deg", "mag")
     )
-    labels = [str(one["label"]) for one in stars]
-    found = common_names(labels, directions_from_radec(ra, dec), mag, epoch_jyear)
-    return [None if name == label else name for name, label in zip(found, labels, strict=True)]
+    labels = [str(star["label"]) for star in stars]
+    names = common_names(labels, directions_from_radec(ra, dec), mag, epoch_jyear)
+    return [None if name == label else name for name, label in zip(names, labels, strict=True)]
 
 
 def outline_of(camera: Camera) -> list[list[float]]:
@@ -174,27 +174,29 @@ def sky_view(
     **more: Any,
 ) -> dict[str, Any]:
     """Return the data for the script of the view: addresses, a camera's field, marked stars."""
-    own, address = camera or database.camera, f"/databases/{database.id}"
+    view_camera, address = camera or database.camera, f"/databases/{database.id}"
     return {
         "stars": f"{address}/sky.json",
         "sql": f"{address}/sql",
         "simbad": SIMBAD,
         "vizier": VIZIER,
         "catalog": _cds_catalog(str(database.spec["catalog"]["source"])),
-        "outline": outline_of(own),
-        "fov": [own.fov_x_deg, own.fov_y_deg],
-        "marks": [one.as_dict() for one in marks],
+        "outline": outline_of(view_camera),
+        "fov": [view_camera.fov_x_deg, view_camera.fov_y_deg],
+        "marks": [mark.as_dict() for mark in marks],
         **more,
     }
 
 
-def around(places: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+def around(positions: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Return a view that contains some positions: its centre, and its angle across, degrees."""
-    ra, dec = (np.array([one[name] for one in places]) for name in ("ra_deg", "dec_deg"))
+    ra, dec = (
+        np.array([position[name] for position in positions]) for name in ("ra_deg", "dec_deg")
+    )
     directions = directions_from_radec(ra, dec)
     middle = directions.sum(axis=0)
     length = float(np.sqrt(middle @ middle))
-    if length < 0.3 * len(places):  # all over the sky
+    if length < 0.3 * len(positions):  # all over the sky
         return {"ra": 0.0, "dec": 0.0, "size": 360.0}
     middle /= length
     reach = float(np.degrees(separation(directions, middle).max()))

@@ -34,17 +34,17 @@ def create_page(
     expires_days: Annotated[str, Form(max_length=20)] = "",
 ) -> Response:
     """Create a token and show it, once."""
-    given = {"name": name.strip(), "role": role, "expires_days": expires_days}
+    fields = {"name": name.strip(), "role": role, "expires_days": expires_days}
     try:
-        wanted = api.NewToken.model_validate(given)
-        made = api.create_token(wanted, service, manager)
+        new_token = api.NewToken.model_validate(fields)
+        created = api.create_token(new_token, service, manager)
     except ValidationError as error:
         key, words = validation_message(error)
-        return _page(request, service, manager, status=422, given=given, errors={key: words})
+        return _page(request, service, manager, status=422, fields=fields, errors={key: words})
     except ConfigError as error:
         errors = {"name": str(error)}
-        return _page(request, service, manager, status=422, given=given, errors=errors)
-    return _page(request, service, manager, made=made)
+        return _page(request, service, manager, status=422, fields=fields, errors=errors)
+    return _page(request, service, manager, created=created)
 
 
 @router.post("/tokens/{token_id}/revoke")
@@ -58,6 +58,6 @@ def _page(
     request: Request, service: Service, manager: TokenManager, status: int = 200, **more: Any
 ) -> Response:
     empty = {"name": "", "role": "reader", "expires_days": "90"}
-    content = {"given": empty, "errors": {}, "made": None, **more}
+    content = {"fields": empty, "errors": {}, "created": None, **more}
     tokens = api.all_tokens(service, manager).tokens
     return render(request, "tokens.html", status=status, tokens=tokens, **content)

@@ -76,9 +76,9 @@ def advice_in_page_words(advice: Sequence[str]) -> str:
 
 def problem_in_page_words(problem: ProblemDetails | Mapping[str, Any]) -> str:
     """Return the detail of problem details, also of the problem details stored with a job."""
-    found = problem.model_dump() if isinstance(problem, ProblemDetails) else problem
-    error = error_from_fields({**found, "kind": "StarcatError"}) if found.get("problem") else None
-    return str(found.get("detail") or "") if error is None else error.message(label_of)
+    fields = problem.model_dump() if isinstance(problem, ProblemDetails) else problem
+    error = error_from_fields({**fields, "kind": "StarcatError"}) if fields.get("problem") else None
+    return str(fields.get("detail") or "") if error is None else error.message(label_of)
 
 
 def page_problem(error: Exception) -> ProblemDetails:
