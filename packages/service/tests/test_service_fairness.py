@@ -24,7 +24,7 @@ from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.problems import Problem, problem_of
 from starcat_service.sandbox import query_engine
 from starcat_service.sandbox.limiter import Limiter, asker
-from starcat_service.sandbox.pool import SHORT_PLACES, SHORT_S, Pool, QueryPool
+from starcat_service.sandbox.pool import SHORT_SLOTS, SHORT_S, Pool, QueryPool
 from starcat_service.sandbox.query_engine import ConfinedEngine
 from starcat_service.sandbox.sandbox import Sandbox
 from starcat_service.security.request_limits import OWN_CONNECTIONS, Shares
@@ -44,14 +44,14 @@ def pool(tmp_path: Path) -> Iterator[QueryPool]:
 # Places.
 
 
-_held: list[ExitStack] = []  # a place without a reference would be given back
+_held: list[ExitStack] = []  # a slot without a reference would be given back
 
 
 def taken(shared: Limiter, who: str) -> ExitStack | None:
     """Return a place of a client that is given back by ``close``, None if there is none at once."""
     held = ExitStack()
     try:
-        held.enter_context(shared.held(who, 0.0))
+        held.enter_context(shared.hold(who, 0.0))
     except Problem:
         return None
     _held.append(held)
@@ -77,7 +77,7 @@ def test_a_free_place_is_for_who_holds_fewest_and_then_for_who_waits_in_turn():
     held = {who: taken(shared, who) for who in ("greedy", "anna")}
 
     def wait(who: str) -> None:
-        with shared.held(who, 10.0):
+        with shared.hold(who, 10.0):
             order.append(who)
 
     threads = []
@@ -98,8 +98,8 @@ def test_a_free_place_is_for_who_holds_fewest_and_then_for_who_waits_in_turn():
 
 def test_a_request_that_waits_too_long_has_to_be_repeated():
     shared = Limiter(1, 1)
-    with shared.held("anna", 1.0):
-        with pytest.raises(Problem, match="ask again later") as caught, shared.held("bob", 0.01):
+    with shared.hold("anna", 1.0):
+        with pytest.raises(Problem, match="ask again later") as caught, shared.hold("bob", 0.01):
             pass
         assert caught.value.status == 503
         assert int(caught.value.headers["Retry-After"]) >= 1
@@ -114,7 +114,7 @@ def test_a_client_that_goes_while_it_waits_takes_no_place():
     shared = Limiter(1, 1)
 
     async def go() -> None:
-        with shared.held("anna", 1.0):
+        with shared.hold("anna", 1.0):
             asker.set("bob")
             waiting = asyncio.create_task(shared.run(10.0, str))
             await asyncio.sleep(0.01)
@@ -129,7 +129,7 @@ def test_a_place_is_held_as_long_as_something_uses_it():
     shared, using = Limiter(1, 1), ExitStack()
 
     def begin() -> None:
-        place = shared.place.get()
+        place = shared.slot.get()
         assert place is not None
         using.enter_context(place.used())
 
@@ -231,7 +231,7 @@ def test_answers_of_tap_hold_a_place_until_they_are_sent(root):
         assert [one.status_code for one in found] == [200, 200]
         assert [one.text.count("\n") for one in found] == [4, 2]
         limiter = client.app.state.service.query_pool._limiter
-        assert limiter._free == SHORT_PLACES + 2, "all places are given back"
+        assert limiter._free == SHORT_SLOTS + 2, "all slots are given back"
 
 
 def client_at(client: TestClient, address: str) -> TestClient:

@@ -26,7 +26,7 @@ from starcat_service.protocols.adql_shapes import (
     condition_of,
     is_text,
     number_sql,
-    places_of,
+    points_of,
     raw,
     shape_of,
     sql_text,
@@ -151,25 +151,25 @@ def translate_adql(
     already; no other query may be sent before the last row has been read.
     """
     with session.ask(asked.sql) as running:
-        found = running.columns
-    columns = _known(asked.columns, [name for name, _ in found])
-    chosen = ", ".join(
+        result_columns = running.columns
+    columns = _named_columns(asked.columns, [name for name, _ in result_columns])
+    selected = ", ".join(
         f"{cast(f'#{k}', kind)} AS {quoted_name(column.name)}"
-        for k, ((_, kind), column) in enumerate(zip(found, columns, strict=True), start=1)
+        for k, ((_, kind), column) in enumerate(zip(result_columns, columns, strict=True), start=1)
     )
     limit = "" if max_rows is None else f" LIMIT {max_rows + 1}"
     with session.ask(
-        f"SELECT {chosen} FROM ({asked.sql}) AS found{limit}", progress=progress
+        f"SELECT {selected} FROM ({asked.sql}) AS found{limit}", progress=progress
     ) as it:
         batches = described(it.batches(), (column.facts for column in columns))
     return begun(batches)
 
 
-def _known(columns: tuple[TapColumn, ...] | None, names: list[str]) -> list[TapColumn]:
+def _named_columns(columns: tuple[TapColumn, ...] | None, names: list[str]) -> list[TapColumn]:
     """Return the columns of an answer with unique names."""
     if columns is None or len(columns) != len(names):
         columns = tuple(map(TapColumn.unknown, names))
-    given: list[TapColumn] = []
+    named: list[TapColumn] = []
     taken: set[str] = set()
     for column in columns:
         name, number = column.name, 1
@@ -177,8 +177,8 @@ def _known(columns: tuple[TapColumn, ...] | None, names: list[str]) -> list[TapC
             number += 1
             name = f"{column.name}_{number}"
         taken.add(name.lower())
-        given.append(column.named(name))
-    return given
+        named.append(column.named(name))
+    return named
 
 
 class _Translator:
@@ -232,8 +232,8 @@ class _Translator:
 
     def _compare(self, part: exp.EQ | exp.NEQ) -> None:
         """Write ``1 = CONTAINS(...)`` as its condition, which DuckDB can use to skip data."""
-        for one, other in ((part.this, part.expression), (part.expression, part.this)):
-            asked = condition_of(one)
+        for side, other in ((part.this, part.expression), (part.expression, part.this)):
+            asked = condition_of(side)
             number = "" if asked is None else sql_text(other)
             if asked is not None and number in ("0", "1"):
                 is_asked = (number == "1") == isinstance(part, exp.EQ)
@@ -248,11 +248,11 @@ class _Translator:
         near, far = part.this, part.expression
         if isinstance(part, (exp.GT, exp.GTE)):
             near, far = far, near
-        places = places_of(near)
-        if places is None or not _chooses(part):
+        points = points_of(near)
+        if points is None or not _chooses(part):
             return
         sign = "<=" if isinstance(part, (exp.LTE, exp.GTE)) else "<"
-        part.replace(raw(within(*places, sign, f"({sql_text(far)})")))
+        part.replace(raw(within(*points, sign, f"({sql_text(far)})")))
 
     def _call(self, part: exp.Anonymous) -> None:
         name = part.this.upper() if isinstance(part.this, str) else ""
@@ -262,10 +262,10 @@ class _Translator:
             self._in_unit(part)
             return
         if name not in FUNCTIONS:
-            known = sorted({*FUNCTIONS, *GEOMETRY, "IN_UNIT", "CAST"})
+            names = sorted({*FUNCTIONS, *GEOMETRY, "IN_UNIT", "CAST"})
             raise AdqlRefusal(
-                f"no function {quoted(part.name)}; {suggest(name, known)}there are "
-                f"{', '.join(known)}",
+                f"no function {quoted(part.name)}; {suggest(name, names)}there are "
+                f"{', '.join(names)}",
                 part,
             )
         function = FUNCTIONS[name]
@@ -286,20 +286,20 @@ class _Translator:
     def _in_unit(self, part: exp.Anonymous) -> None:
         """Write the factor between two units of a column."""
         check_count(part, 2, 2)
-        value, wanted = part.expressions
-        if not isinstance(value, exp.Column) or not is_text(wanted):
+        value, unit = part.expressions
+        if not isinstance(value, exp.Column) or not is_text(unit):
             raise AdqlRefusal("IN_UNIT takes a column and a unit, as IN_UNIT(ra, 'rad')", part)
-        found = self._names.column(value)
-        if found is None or not found.unit:
+        column = self._names.column(value)
+        if column is None or not column.unit:
             raise AdqlRefusal(f"IN_UNIT: the column {quoted(value.name)} has no unit", part)
         from astropy import units
 
         try:
-            factor = units.Unit(found.unit).to(units.Unit(wanted.name))
+            factor = units.Unit(column.unit).to(units.Unit(unit.name))
         except (ValueError, TypeError) as error:
             raise AdqlRefusal(
-                f"IN_UNIT: {quoted(found.unit)} of {value.name} cannot be converted to "
-                f"{quoted(wanted.name)}",
+                f"IN_UNIT: {quoted(column.unit)} of {value.name} cannot be converted to "
+                f"{quoted(unit.name)}",
                 part,
             ) from error
         part.replace(raw(f"({sql_text(value)} * {float(factor)!r}::DOUBLE)"))

@@ -38,25 +38,25 @@ class Names:
         """Replace the name of a table by its full name in the session."""
         if not table.db and self._common(table, table.name) is not None:
             return
-        found = self._tables.find(table.db, table.name)
-        if found is None:
-            given = f"{table.db}.{table.name}" if table.db else table.name
-            known = self._tables.names()
+        tap_table = self._tables.find(table.db, table.name)
+        if tap_table is None:
+            name = f"{table.db}.{table.name}" if table.db else table.name
+            names = self._tables.names()
             raise AdqlRefusal(
-                f"no table {quoted(given)}; {suggest(given, known)}TAP_SCHEMA.tables lists the "
-                f"{len(known)} that there are, each with its schema",
+                f"no table {quoted(name)}; {suggest(name, names)}TAP_SCHEMA.tables lists the "
+                f"{len(names)} that there are, each with its schema",
                 table,
             )
-        view = found.view or found.name
-        if not table.alias and (not table.db or view != found.name):
+        view = tap_table.view or tap_table.name
+        if not table.alias and (not table.db or view != tap_table.name):
             table.set("alias", exp.TableAlias(this=exp.to_identifier(table.name, quoted=True)))
         table.set("this", exp.to_identifier(view, quoted=True))
-        table.set("db", exp.to_identifier(found.schema, quoted=True))
+        table.set("db", exp.to_identifier(tap_table.schema, quoted=True))
 
     def shorten(self, column: exp.Column) -> None:
         """Drop the schema of a column whose view has another name than its table."""
-        found = self._tables.find(column.db, column.table) if column.db else None
-        if found is not None and found.view:
+        tap_table = self._tables.find(column.db, column.table) if column.db else None
+        if tap_table is not None and tap_table.view:
             column.set("db", None)
 
     def columns(self, query: exp.Expr) -> Columns | None:
@@ -65,62 +65,62 @@ class Names:
             query = query.this
         if not isinstance(query, exp.Select):
             return None
-        found: list[TapColumn] = []
+        columns: list[TapColumn] = []
         for number, part in enumerate(query.expressions, start=1):
             more = self._projected(query, part, number)
             if more is None:
                 return None
-            found += more
-        return tuple(found)
+            columns += more
+        return tuple(columns)
 
     def column(self, column: exp.Column) -> TapColumn | None:
         """Return the description of a column that a query names."""
         for select in self._around(column):
-            found = self._in(select, column)
-            if found is not None:
-                return found
+            tap_column = self._in(select, column)
+            if tap_column is not None:
+                return tap_column
         return None
 
     def check(self, column: exp.Column) -> None:
         """Check that the query can see a column."""
         if isinstance(column.this, exp.Star) or self.column(column) is not None:
             return
-        known: set[str] = set()
+        names: set[str] = set()
         around = self._around(column)
         if not around:
             return  # the ORDER BY of several queries names columns of the answer
         for select in around:
-            known |= {part.alias.lower() for part in select.expressions if part.alias}
+            names |= {part.alias.lower() for part in select.expressions if part.alias}
             for source in self.sources(select):
                 if source.columns is None:
                     return
                 if not column.table or column.table.lower() == source.name:
-                    known |= {one.name.lower() for one in source.columns}
-        if column.name.lower() in known:
+                    names |= {tap_column.name.lower() for tap_column in source.columns}
+        if column.name.lower() in names:
             return
         where = f" in {quoted(column.table)}" if column.table else ""
         raise AdqlRefusal(
-            f"no column {quoted(column.name)}{where}; {suggest(column.name.lower(), known)}"
-            f"{'there are ' + ', '.join(sorted(known)[:12]) if known else 'no table has the name'}",
+            f"no column {quoted(column.name)}{where}; {suggest(column.name.lower(), names)}"
+            f"{'there are ' + ', '.join(sorted(names)[:12]) if names else 'no table has the name'}",
             column,
         )
 
     def _around(self, part: exp.Expr) -> list[exp.Select]:
         """Return the queries that contain a part, from the innermost out."""
-        found: list[exp.Select] = []
+        selects: list[exp.Select] = []
         select = self._select.get(id(part))
         while select is not None:
-            found.append(select)
+            selects.append(select)
             select = self._select.get(id(select.parent)) if select.parent else None
-        return found
+        return selects
 
     def sources(self, select: exp.Select) -> list[Source]:
         """Return the tables and subqueries after FROM in a query."""
         if id(select) not in self._sources_of:
             first = select.args.get("from_")
             parts = [*([first] if first else ()), *(select.args.get("joins") or ())]
-            found = [source for part in parts for source in self._sources(part.this)]
-            self._sources_of[id(select)] = found
+            sources = [source for part in parts for source in self._sources(part.this)]
+            self._sources_of[id(select)] = sources
         return self._sources_of[id(select)]
 
     def _sources(self, part: exp.Expr) -> Iterator[Source]:
@@ -138,17 +138,17 @@ class Names:
     def _of(self, table: exp.Table) -> Columns | None:
         if not table.db and (common := self._common(table, table.name)) is not None:
             return self._renamed(common, self.columns(common.this))
-        found = self._tables.find(table.db, table.name)
-        return found.columns if found else None
+        tap_table = self._tables.find(table.db, table.name)
+        return tap_table.columns if tap_table else None
 
     def _renamed(self, part: exp.Expr, columns: Columns | None) -> Columns | None:
         """Return columns with the names that an alias gives them."""
         alias = part.args.get("alias")
-        names = [one.name for one in alias.args.get("columns") or ()] if alias else []
+        names = [identifier.name for identifier in alias.args.get("columns") or ()] if alias else []
         if not names or columns is None or len(names) > len(columns):
             return columns
-        given = tuple(one.named(name) for one, name in zip(columns, names, strict=False))
-        return given + columns[len(names) :]
+        renamed = tuple(column.named(name) for column, name in zip(columns, names, strict=False))
+        return renamed + columns[len(names) :]
 
     def _common(self, part: exp.Expr, name: str) -> exp.CTE | None:
         """Return the query of WITH that a name refers to at a position in the query."""
@@ -163,10 +163,10 @@ class Names:
                     while inside is not None and inside.parent is not common:
                         inside = inside.find_ancestor(exp.CTE)
                     before = before[: before.index(inside)] if inside in before else before
-                for one in reversed(before):
-                    if one.alias.lower() == name.lower():
-                        found: exp.CTE = one
-                        return found
+                for earlier in reversed(before):
+                    if earlier.alias.lower() == name.lower():
+                        cte: exp.CTE = earlier
+                        return cte
             child, parent = parent, parent.parent
         return None
 
@@ -176,26 +176,26 @@ class Names:
             if any(join.args.get("using") or join.args.get("method") for join in joins):
                 return None
             table = part.table.lower() if isinstance(part, exp.Column) else ""
-            chosen = [s for s in self.sources(query) if not table or s.name == table]
-            found: list[TapColumn] = []
-            for source in chosen:
+            sources = [s for s in self.sources(query) if not table or s.name == table]
+            columns: list[TapColumn] = []
+            for source in sources:
                 if source.columns is None:
                     return None
-                found += source.columns
-            return found
+                columns += source.columns
+            return columns
         value = part.this if isinstance(part, exp.Alias) else part
         name = part.alias or _default_name(value, number)
-        known = self._in(query, value) if isinstance(value, exp.Column) else None
-        return [known.named(name) if known else TapColumn.unknown(name)]
+        column = self._in(query, value) if isinstance(value, exp.Column) else None
+        return [column.named(name) if column else TapColumn.unknown(name)]
 
     def _in(self, select: exp.Select, column: exp.Column) -> TapColumn | None:
         table = column.table.lower()
         for source in self.sources(select):
             if table and table != source.name:
                 continue
-            for one in source.columns or ():
-                if one.name.lower() == column.name.lower():
-                    return one
+            for tap_column in source.columns or ():
+                if tap_column.name.lower() == column.name.lower():
+                    return tap_column
         return None
 
 

@@ -43,7 +43,7 @@ class Point:
     lat: str
 
     @cached_property
-    def known(self) -> tuple[float, float] | None:
+    def fixed_deg(self) -> tuple[float, float] | None:
         """The place in degrees, if it does not depend on a row."""
         lon, lat = _number_in(self.lon), _number_in(self.lat)
         return (lon, lat) if lon is not None and lat is not None else None
@@ -51,10 +51,10 @@ class Point:
     @cached_property
     def vector(self) -> Vector:
         """The direction of the place."""
-        if self.known is None:
+        if self.fixed_deg is None:
             x, y = f"cosd({self.lat}) * cosd({self.lon})", f"cosd({self.lat}) * sind({self.lon})"
             return f"({x})", f"({y})", f"sind({self.lat})"
-        lon, lat = map(math.radians, self.known)
+        lon, lat = map(math.radians, self.fixed_deg)
         return math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)
 
     @property
@@ -157,28 +157,28 @@ def contains(inner: Shape, outer: Shape) -> str:
     return _all_of([*within, {"true": "false", "false": "true"}.get(crossing, f"NOT {crossing}")])
 
 
-def intersects(one: Shape, other: Shape) -> str:
+def intersects(shape: Shape, other: Shape) -> str:
     """Return SQL of whether two shapes overlap."""
-    if isinstance(one, Point):
-        return contains(one, other)
+    if isinstance(shape, Point):
+        return contains(shape, other)
     if isinstance(other, Point):
-        return contains(other, one)
-    if isinstance(one, Circle) and isinstance(other, Circle):
-        reach = _plus(_term_of(one.radius), _term_of(other.radius))
-        return _compared(_apart(one.centre, other.centre), "<=", reach)
-    if isinstance(one, Circle) and isinstance(other, Polygon):
-        centre, radius = one.centre, _term_of(one.radius)
+        return contains(other, shape)
+    if isinstance(shape, Circle) and isinstance(other, Circle):
+        reach = _plus(_term_of(shape.radius), _term_of(other.radius))
+        return _compared(_apart(shape.centre, other.centre), "<=", reach)
+    if isinstance(shape, Circle) and isinstance(other, Polygon):
+        centre, radius = shape.centre, _term_of(shape.radius)
         near = (_compared(_from_side(centre, a, b), "<=", radius) for a, b in other.sides)
         return _any_of([_in_polygon(centre, other), *near])
-    if isinstance(one, Polygon) and isinstance(other, Polygon):
-        inside = [_in_polygon(one.corners[0], other), _in_polygon(other.corners[0], one)]
-        return _any_of([*inside, _sides_cross(one, other)])
-    return intersects(other, one)
+    if isinstance(shape, Polygon) and isinstance(other, Polygon):
+        inside = [_in_polygon(shape.corners[0], other), _in_polygon(other.corners[0], shape)]
+        return _any_of([*inside, _sides_cross(shape, other)])
+    return intersects(other, shape)
 
 
-def distance(one: Point, other: Point) -> str:
+def distance(point: Point, other: Point) -> str:
     """Return SQL of the separation of two points, degrees."""
-    return _sql_of(_apart(one, other))
+    return _sql_of(_apart(point, other))
 
 
 def area(shape: Shape) -> str:
@@ -211,10 +211,10 @@ def centroid(shape: Shape) -> Point:
         total = (x, y, z)
     sign = _sign_of(shape.turn)
     x, y, z = (_times(sign, part) for part in total)
-    return _place_at(x, y, z)
+    return _point_at(x, y, z)
 
 
-def _place_at(x: Term, y: Term, z: Term) -> Point:
+def _point_at(x: Term, y: Term, z: Term) -> Point:
     lon = _arctan(y, x)
     lat = _arctan(z, _root(_added(_times(x, x), _times(y, y))))
     if isinstance(lon, float) and isinstance(lat, float):
@@ -235,13 +235,13 @@ def from_galactic(shape: Shape) -> Shape:
     return shape if isinstance(shape, Zone) else _from_galactic(shape)
 
 
-def _from_galactic(place: Point) -> Point:
-    along = place.vector
+def _from_galactic(point: Point) -> Point:
+    along = point.vector
     x, y, z = (
         _added(*(_times(axis[k], part) for axis, part in zip(_GALACTIC, along, strict=True)))
         for k in range(3)
     )
-    return _place_at(x, y, z)
+    return _point_at(x, y, z)
 
 
 def characters(shapes: Sequence[Shape]) -> int:
@@ -271,8 +271,8 @@ def box(centre: Point, width: str, height: str) -> Shape:
     A box of half a turn or more, or beyond a pole, is a `Zone`, between meridians and parallels.
     """
     sizes = _number_in(width), _number_in(height)
-    if centre.known is not None and sizes[0] is not None and sizes[1] is not None:
-        lat, half = centre.known[1], sizes[1] / 2.0
+    if centre.fixed_deg is not None and sizes[0] is not None and sizes[1] is not None:
+        lat, half = centre.fixed_deg[1], sizes[1] / 2.0
         if sizes[0] >= 180.0 or abs(lat) + half > 90.0:
             low, high = max(-90.0, lat - half), min(90.0, lat + half)
             is_all = sizes[0] >= 360.0 and (low, high) == (-90.0, 90.0)
@@ -285,28 +285,28 @@ def box(centre: Point, width: str, height: str) -> Shape:
 
 
 def _folded(middle: str, sign: str, width: str) -> str:
-    known = _number_in(middle), _number_in(width)
-    if known[0] is not None and known[1] is not None:
-        half = known[1] / 2.0
-        return repr(known[0] + half if sign == "+" else known[0] - half)
+    numbers = _number_in(middle), _number_in(width)
+    if numbers[0] is not None and numbers[1] is not None:
+        half = numbers[1] / 2.0
+        return repr(numbers[0] + half if sign == "+" else numbers[0] - half)
     return f"({middle} {sign} ({width}) / 2e0)"
 
 
-def _in_circle(place: Point, circle: Circle) -> str:
-    return within(place, circle.centre, "<=", circle.radius)
+def _in_circle(point: Point, circle: Circle) -> str:
+    return within(point, circle.centre, "<=", circle.radius)
 
 
-def within(one: Point, other: Point, sign: str, radius: str) -> str:
+def within(point: Point, other: Point, sign: str, radius: str) -> str:
     """Return SQL of whether the separation of two points is less than a radius, degrees."""
-    place, middle = (other, one) if one.known else (one, other)
-    near = _compared(_apart(place, middle), sign, _term_of(radius))
-    if place.known:
+    free, middle = (other, point) if point.fixed_deg else (point, other)
+    near = _compared(_apart(free, middle), sign, _term_of(radius))
+    if free.fixed_deg:
         return near
     lat = _term_of(middle.lat)
     reach = _plus(_term_of(radius), MARGIN_DEG)
     low, high = _sql_of(_plus(lat, _times(-1.0, reach))), _sql_of(_plus(lat, reach))
     # Test declinations first: files contain statistics of them.
-    return f"({place.lat} BETWEEN {low} AND {high} AND {near})"
+    return f"({free.lat} BETWEEN {low} AND {high} AND {near})"
 
 
 def _in_zone(inner: Shape, outer: Shape) -> str:
@@ -320,8 +320,8 @@ def _in_zone(inner: Shape, outer: Shape) -> str:
     return f"({band} AND {turned} <= {outer.width / 2.0!r})"
 
 
-def _in_polygon(place: Point, polygon: Polygon) -> str:
-    p = place.vector
+def _in_polygon(point: Point, polygon: Polygon) -> str:
+    p = point.vector
     angles = []
     for a, b in polygon.sides:
         u, v = a.vector, b.vector
@@ -330,13 +330,13 @@ def _in_polygon(place: Point, polygon: Polygon) -> str:
         angles.append(_arctan(across, along))
     round_ = _times(_sign_of(polygon.turn), _added(*angles))
     inside = _compared(round_, ">", math.pi)
-    band = None if place.known else _band(polygon)
-    return f"({place.lat} BETWEEN {band[0]} AND {band[1]} AND {inside})" if band else inside
+    band = None if point.fixed_deg else _band(polygon)
+    return f"({point.lat} BETWEEN {band[0]} AND {band[1]} AND {inside})" if band else inside
 
 
 def _band(polygon: Polygon) -> tuple[str, str] | None:
     """Return a range of declinations that contains a polygon, if its corners are known."""
-    vectors = [corner.vector for corner in polygon.corners if corner.known]
+    vectors = [corner.vector for corner in polygon.corners if corner.fixed_deg]
     if len(vectors) < len(polygon.corners):
         return None
     numbers = [[float(part) for part in vector] for vector in vectors]
@@ -353,42 +353,42 @@ def _band(polygon: Polygon) -> tuple[str, str] | None:
     return _sql_of(lat - reach - 1e-6), _sql_of(lat + reach + 1e-6)
 
 
-def _from_side(place: Point, a: Point, b: Point) -> Term:
+def _from_side(point: Point, a: Point, b: Point) -> Term:
     """Return the separation of a point from the arc between two others, degrees."""
-    p, u, v = place.vector, a.vector, b.vector
+    p, u, v = point.vector, a.vector, b.vector
     normal = _cross(u, v)
     away = _cross(p, normal)
     height = _arctan(_dot(p, normal), _root(_dot(away, away)))
     beside = _dot(p, _cross(normal, u)), _dot(p, _cross(v, normal))
-    ends = _apart(place, a), _apart(place, b)
-    if isinstance(height, float) and place.known and a.known and b.known:
+    ends = _apart(point, a), _apart(point, b)
+    if isinstance(height, float) and point.fixed_deg and a.fixed_deg and b.fixed_deg:
         is_beside = min(map(float, beside)) >= 0.0
         return math.degrees(abs(height)) if is_beside else min(map(float, ends))
-    asked = " AND ".join(_compared(one, ">=", 0.0) for one in beside)
+    asked = " AND ".join(_compared(term, ">=", 0.0) for term in beside)
     nearest = f"least({_sql_of(ends[0])}, {_sql_of(ends[1])})"
     return f"(CASE WHEN {asked} THEN abs(degrees({_sql_of(height)})) ELSE {nearest} END)"
 
 
-def _sides_cross(one: Polygon, other: Polygon) -> str:
-    found = []
-    for a, b in one.sides:
+def _sides_cross(polygon: Polygon, other: Polygon) -> str:
+    conditions = []
+    for a, b in polygon.sides:
         for c, d in other.sides:
             u, v, w, t = a.vector, b.vector, c.vector, d.vector
             turns = (
                 _dot(u, _cross(w, v)), _dot(w, _cross(v, t)),
                 _dot(v, _cross(t, u)), _dot(t, _cross(u, w)),
             )  # fmt: skip
-            found += [_all_of(_compared(turn, sign, 0.0) for turn in turns) for sign in "<>"]
-    return _any_of(found)
+            conditions += [_all_of(_compared(turn, sign, 0.0) for turn in turns) for sign in "<>"]
+    return _any_of(conditions)
 
 
-def _apart(one: Point, other: Point) -> Term:
-    if one.known and other.known:
-        across = _cross(one.vector, other.vector)
+def _apart(point: Point, other: Point) -> Term:
+    if point.fixed_deg and other.fixed_deg:
+        across = _cross(point.vector, other.vector)
         return math.degrees(
-            float(_arctan(_root(_dot(across, across)), _dot(one.vector, other.vector)))
+            float(_arctan(_root(_dot(across, across)), _dot(point.vector, other.vector)))
         )
-    return f"separation({one.lon}, {one.lat}, {other.lon}, {other.lat})"
+    return f"separation({point.lon}, {point.lat}, {other.lon}, {other.lat})"
 
 
 def _list(*numbers: str) -> str:
@@ -396,17 +396,17 @@ def _list(*numbers: str) -> str:
 
 
 def _term_of(text: str) -> Term:
-    found = _number_in(text)
-    return f"({text})" if found is None else found
+    number = _number_in(text)
+    return f"({text})" if number is None else number
 
 
 def _number_in(text: str) -> float | None:
     """Return the number that a piece of SQL consists of, or None."""
     try:
-        found = float(text.strip("() ").replace("- ", "-"))
+        number = float(text.strip("() ").replace("- ", "-"))
     except ValueError:
         return None
-    return found if math.isfinite(found) else None
+    return number if math.isfinite(number) else None
 
 
 def _sql_of(term: Term) -> str:
@@ -480,14 +480,14 @@ def _compared(a: Term, sign: str, b: Term) -> str:
 
 def _all_of(conditions: Iterable[str]) -> str:
     """Return the SQL that all conditions hold; conditions that always hold are left out."""
-    left = [one for one in conditions if one != "true"]
-    return "false" if "false" in left else _joined(left, " AND ", "true")
+    remaining = [condition for condition in conditions if condition != "true"]
+    return "false" if "false" in remaining else _joined(remaining, " AND ", "true")
 
 
 def _any_of(conditions: Iterable[str]) -> str:
     """Return SQL of whether any condition holds; conditions known to fail are left out."""
-    left = [one for one in conditions if one != "false"]
-    return "true" if "true" in left else _joined(left, " OR ", "false")
+    remaining = [condition for condition in conditions if condition != "false"]
+    return "true" if "true" in remaining else _joined(remaining, " OR ", "false")
 
 
 def _joined(conditions: list[str], word: str, nothing: str) -> str:

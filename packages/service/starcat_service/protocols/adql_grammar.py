@@ -116,13 +116,13 @@ class _Parser(parser.Parser):
         if value is None or not self._match(TokenType.ALIAS):
             self.raise_error("CAST needs AS: write CAST(value AS INTEGER)")
         word = self._curr.text.upper()
-        place = self._curr
+        token = self._curr
         self._advance()
         if word == "DOUBLE" and self._curr and self._curr.text.upper() == "PRECISION":
             self._advance()
             word = "DOUBLE PRECISION"
         if word not in _TYPES:
-            self.raise_error(f"CAST makes {', '.join(_TYPES)}, and not {word}", place)
+            self.raise_error(f"CAST makes {', '.join(_TYPES)}, and not {word}", token)
         sizes: list[exp.Expr] = []
         if word in ("CHAR", "VARCHAR") and self._match(TokenType.L_PAREN):
             size = self._parse_number()
@@ -172,10 +172,10 @@ def parse_adql(text: str) -> exp.Expr:
                 f"no ADQL: found {quoted(first.text)}; a query begins with SELECT or WITH, and "
                 "only reads"
             )
-        found = [tree for tree in dialect.parse(text) if tree is not None]
-        if len(found) != 1:
-            raise QueryError(f"found {len(found)} queries", hint="send one at a time")
-        tree = found[0]
+        trees = [tree for tree in dialect.parse(text) if tree is not None]
+        if len(trees) != 1:
+            raise QueryError(f"found {len(trees)} queries", hint="send one at a time")
+        tree = trees[0]
         if not isinstance(tree, (exp.Select, exp.SetOperation, exp.Subquery)):
             raise QueryError("no ADQL: a query begins with SELECT or WITH")
         for part in list(tree.walk()):
@@ -195,10 +195,10 @@ def refusals_of(text: str) -> Iterator[None]:
     except ParseError as error:
         raise _refusal(error, text) from error
     except TokenError as error:
-        place = error.start if error.start is not None else 0
+        offset = error.start if error.start is not None else 0
         raise QueryError(
             "no ADQL: a quotation mark that is opened here is not closed, or a character has no "
-            f"place here{pointer(text, place)}"
+            f"place here{pointer(text, offset)}"
         ) from error
     except RecursionError as error:
         raise QueryError(
@@ -207,14 +207,14 @@ def refusals_of(text: str) -> Iterator[None]:
         ) from error
 
 
-def pointer(text: str, place: int | None) -> str:
+def pointer(text: str, offset: int | None) -> str:
     """Return the line of a position with a mark below it."""
-    if place is None or not 0 <= place <= len(text):
+    if offset is None or not 0 <= offset <= len(text):
         return ""
-    before = text[:place]
+    before = text[:offset]
     number = before.count("\n")
     line = text.split("\n")[number]
-    column = place - (before.rfind("\n") + 1)
+    column = offset - (before.rfind("\n") + 1)
     start = max(0, column - POINTED_CHARACTERS // 2)
     shown = line[start : start + POINTED_CHARACTERS]
     where = f" (line {number + 1}, character {column + 1})"
@@ -224,13 +224,13 @@ def pointer(text: str, place: int | None) -> str:
 def _check_part(part: exp.Expr) -> None:
     allowed = _ARGUMENTS.get(type(part))
     if allowed is None:
-        told = _ADVICE.get(part.key, f"{part.key.upper()} is not ADQL 2.1")
-        raise AdqlRefusal(f"no ADQL: {told}", part)
+        reason = _ADVICE.get(part.key, f"{part.key.upper()} is not ADQL 2.1")
+        raise AdqlRefusal(f"no ADQL: {reason}", part)
     for name, value in part.args.items():
         if value and name not in allowed:
             name = name.rstrip("_")
-            told = _ADVICE.get(name, f"{name.upper()} has no place in ADQL here")
-            raise AdqlRefusal(f"no ADQL: {told}", value if isinstance(value, exp.Expr) else part)
+            reason = _ADVICE.get(name, f"{name.upper()} has no place in ADQL here")
+            raise AdqlRefusal(f"no ADQL: {reason}", value if isinstance(value, exp.Expr) else part)
     if isinstance(part, (exp.Limit, exp.Offset)):
         _check_rows(part)
     if isinstance(part, exp.Table) and not isinstance(part.this, exp.Identifier):
@@ -281,16 +281,16 @@ def _check_name(part: exp.Identifier) -> None:
 def _refusal(error: ParseError, text: str) -> QueryError:
     """Return the message for a text that the parser refuses."""
     first = error.errors[0] if error.errors else {}
-    told = str(first.get("description") or "not understood").rstrip(".")
+    reason = str(first.get("description") or "not understood").rstrip(".")
     line, column = first.get("line"), first.get("col")
-    place = None
+    offset = None
     if line and column:
         lines = text.split("\n")
         word = str(first.get("highlight") or "")
         # The parser gives the end of a word.
-        place = sum(len(one) + 1 for one in lines[: line - 1]) + max(0, column - len(word))
-        if told.startswith("Required keyword"):
-            told = "something is missing here"
-        if "Unexpected token" in told:
-            told = f"{quoted(word)} is not expected"
-    return QueryError(f"no ADQL: {told}{pointer(text, place)}")
+        offset = sum(len(above) + 1 for above in lines[: line - 1]) + max(0, column - len(word))
+        if reason.startswith("Required keyword"):
+            reason = "something is missing here"
+        if "Unexpected token" in reason:
+            reason = f"{quoted(word)} is not expected"
+    return QueryError(f"no ADQL: {reason}{pointer(text, offset)}")

@@ -22,25 +22,25 @@ FRAMES = ("", "ICRS", "UNKNOWNFRAME", "GALACTIC")
 """Frames of coordinates; words after a space, as in ``ICRS GEOCENTER``, are ignored."""
 
 _MAX_INTEGER = 2**63 - 1
-_SHAPE, _CONDITION, _PLACES = "shape", "condition", "places"
+_SHAPE, _CONDITION, _POINTS = "shape", "condition", "points"
 
 
 def shape_of(part: exp.Expr) -> Shape | None:
     """Return the shape that a call of geometry makes, or None."""
-    found: Shape | None = part.meta.get(_SHAPE)
-    return found
+    shape: Shape | None = part.meta.get(_SHAPE)
+    return shape
 
 
 def condition_of(part: exp.Expr) -> str | None:
     """Return the condition of CONTAINS or INTERSECTS if a part is its result as a number."""
-    found: str | None = part.meta.get(_CONDITION)
-    return found
+    condition: str | None = part.meta.get(_CONDITION)
+    return condition
 
 
-def places_of(part: exp.Expr) -> tuple[Point, Point] | None:
+def points_of(part: exp.Expr) -> tuple[Point, Point] | None:
     """Return the two points if a part is their separation from DISTANCE, else None."""
-    found: tuple[Point, Point] | None = part.meta.get(_PLACES)
-    return found
+    points: tuple[Point, Point] | None = part.meta.get(_POINTS)
+    return points
 
 
 def raw(sql: str) -> exp.Var:
@@ -68,10 +68,10 @@ def number_sql(text: str) -> str:
 
 def check_count(part: exp.Anonymous, least: int, most: int) -> None:
     """Refuse a call with a wrong number of arguments."""
-    found = len(part.expressions)
-    if not least <= found <= most:
+    count = len(part.expressions)
+    if not least <= count <= most:
         many = str(least) if least == most else f"{least} to {most}"
-        raise AdqlRefusal(f"{part.name.upper()} takes {many} arguments; found {found}", part)
+        raise AdqlRefusal(f"{part.name.upper()} takes {many} arguments; found {count}", part)
 
 
 class GeometryCalls:
@@ -111,8 +111,9 @@ class GeometryCalls:
     def _shapes_of(self, part: exp.Anonymous, count: int) -> list[Shape]:
         name = part.name.upper()
         check_count(part, count, count)
-        found = [shape_of(argument) for argument in part.expressions]
-        shapes = [shape for shape in found if shape is not None]
+        shapes = [
+            shape for argument in part.expressions if (shape := shape_of(argument)) is not None
+        ]
         if len(shapes) < count:
             raise AdqlRefusal(
                 f"{name} takes {count} of POINT, CIRCLE, BOX, POLYGON, CENTROID, written "
@@ -129,10 +130,10 @@ class GeometryCalls:
         return shapes
 
 
-def _replace_distance(part: exp.Expr, *places: Shape) -> None:
-    found = raw(geometry.distance(*places))  # type: ignore[arg-type]
-    found.meta[_PLACES] = places
-    part.replace(found)
+def _replace_distance(part: exp.Expr, *points: Shape) -> None:
+    separation = raw(geometry.distance(*points))  # type: ignore[arg-type]
+    separation.meta[_POINTS] = points
+    part.replace(separation)
 
 
 def _point(part: exp.Anonymous) -> Shape:
@@ -155,12 +156,12 @@ def _centred(part: exp.Anonymous) -> Shape:
     """Return a circle or a box, whose centre is a point or two numbers."""
     first, *others = _without_frame(part) or [part]
     name = part.name.upper()
-    made = _made(name, [*_place_or_number(first), *map(_operand, others)])
-    if made is None or not isinstance(shape_of(first), (Point, type(None))):
+    shape = _shape_with(name, [*_place_or_number(first), *map(_operand, others)])
+    if shape is None or not isinstance(shape_of(first), (Point, type(None))):
         many = "1 more number" if name == "CIRCLE" else "2 more numbers"
         raise AdqlRefusal(f"{name} takes a place, as POINT or two numbers, and {many}", part)
     # The coordinates of a POINT are already ICRS.
-    return made if shape_of(first) is not None else _in_icrs(part, made)
+    return shape if shape_of(first) is not None else _in_icrs(part, shape)
 
 
 def _polygon(part: exp.Anonymous) -> Shape:
@@ -171,19 +172,19 @@ def _polygon(part: exp.Anonymous) -> Shape:
     numbers = [number for argument in arguments for number in _place_or_number(argument)]
     if len(numbers) % 2:
         raise AdqlRefusal("POLYGON takes pairs of numbers", part)
-    made = _made("POLYGON", numbers)
-    if made is None:
+    polygon = _shape_with("POLYGON", numbers)
+    if polygon is None:
         raise AdqlRefusal(
             f"POLYGON takes 3 to {MAX_CORNERS} corners; found {len(numbers) // 2}", part
         )
-    return made if any(shapes) else _in_icrs(part, made)
+    return polygon if any(shapes) else _in_icrs(part, polygon)
 
 
 def _region(part: exp.Anonymous) -> Shape:
     raise AdqlRefusal("REGION is not supported; write CIRCLE, BOX or POLYGON with numbers", part)
 
 
-def _made(name: str, numbers: list[str]) -> Shape | None:
+def _shape_with(name: str, numbers: list[str]) -> Shape | None:
     """Return the shape with these numbers; None if their count is wrong for it."""
     if name == "POLYGON" and len(numbers) % 2 == 0 and 6 <= len(numbers) <= 2 * MAX_CORNERS:
         pairs = zip(numbers[::2], numbers[1::2], strict=True)
@@ -228,8 +229,8 @@ _CONDITIONS = {"CONTAINS": geometry.contains, "INTERSECTS": geometry.intersects}
 _MEASURES: dict[str, Callable[..., str]] = {
     "DISTANCE": geometry.distance,
     "AREA": geometry.area,
-    "COORD1": lambda place: f"(({place.lon})::DOUBLE)",
-    "COORD2": lambda place: f"(({place.lat})::DOUBLE)",
+    "COORD1": lambda point: f"(({point.lon})::DOUBLE)",
+    "COORD2": lambda point: f"(({point.lat})::DOUBLE)",
     "COORDSYS": lambda _: "'ICRS'",
 }
 _OF_POINTS = ("DISTANCE", "COORD1", "COORD2")

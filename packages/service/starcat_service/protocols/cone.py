@@ -50,22 +50,22 @@ class ConeRequest:
 
 def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
     """Check the parameters of a request."""
-    given: dict[str, str] = {}
-    known = {*_RANGES, "VERB", "MAXREC", "RESPONSEFORMAT"}
+    values: dict[str, str] = {}
+    names = {*_RANGES, "VERB", "MAXREC", "RESPONSEFORMAT"}
     for name, value in parameters:
         key = name.upper()
-        if key in given:
+        if key in values:
             raise ConfigError(f"{key} is given twice", key=key, value=value, hint="give it once")
-        if key in known:
-            given[key] = value
-    ra_deg, dec_deg, radius_deg = (_degrees(given, key) for key in _RANGES)
+        if key in names:
+            values[key] = value
+    ra_deg, dec_deg, radius_deg = (_degrees(values, key) for key in _RANGES)
     return ConeRequest(
         ra_deg,
         dec_deg,
         radius_deg,
-        _whole(given, "VERB", _USUAL, _BRIEF, _ALL) or _USUAL,
-        _whole(given, "MAXREC", None, 0, None),
-        *_form(given.get("RESPONSEFORMAT", "")),
+        _whole(values, "VERB", _USUAL, _BRIEF, _ALL) or _USUAL,
+        _whole(values, "MAXREC", None, 0, None),
+        *_form(values.get("RESPONSEFORMAT", "")),
     )
 
 
@@ -79,13 +79,13 @@ def star_view(session: Session) -> View:
 
 def cone_query(view: View, asked: ConeRequest, maxrec: int) -> str:
     """Return the SQL of a search."""
-    chosen = [_selected(view, name) for name in _columns(view, asked.verbosity)]
-    place = f"{asked.ra_deg!r}, {asked.dec_deg!r}, {asked.radius_deg!r}"
+    selected = [_selected(view, name) for name in _columns(view, asked.verbosity)]
+    centre = f"{asked.ra_deg!r}, {asked.dec_deg!r}, {asked.radius_deg!r}"
     order = ", ".join([SEPARATION, *(quoted_name(n) for n in NAMES if n in view.columns)])
     limit = maxrec + 1 if asked.radius_deg else 0
     return (
-        f"SELECT {', '.join([*chosen, SEPARATION])} "
-        f"FROM cone({place}, of := {sql_text(view.name)}) ORDER BY {order} LIMIT {limit}"
+        f"SELECT {', '.join([*selected, SEPARATION])} "
+        f"FROM cone({centre}, of := {sql_text(view.name)}) ORDER BY {order} LIMIT {limit}"
     )
 
 
@@ -103,14 +103,14 @@ def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader
 def _columns(view: View, verbosity: int) -> list[str]:
     """Return the columns of an answer; identity and position come first."""
     first = [_name_of(view), *(view.position)]
-    known = {column.name: column.ucd for column in view.described}
-    wanted = {
+    ucds = {column.name: column.ucd for column in view.described}
+    columns = {
         _BRIEF: [],
-        _USUAL: [name for name in view.columns if known.get(name) or name in _BESIDE],
+        _USUAL: [name for name in view.columns if ucds.get(name) or name in _BESIDE],
         _ALL: list(view.columns),
     }[verbosity]
     # A table without descriptions of its columns has no usual ones.
-    rest = wanted if known or verbosity == _BRIEF else list(view.columns)
+    rest = columns if ucds or verbosity == _BRIEF else list(view.columns)
     return [*first, *(name for name in rest if name not in first and name != SEPARATION)]
 
 
@@ -125,21 +125,21 @@ def _selected(view: View, name: str) -> str:
     return f"CAST({column} AS VARCHAR) AS {column}" if name == _name_of(view) else column
 
 
-def _degrees(given: Mapping[str, str], key: str) -> float:
+def _degrees(values: Mapping[str, str], key: str) -> float:
     least, most = _RANGES[key]
-    if key not in given:
+    if key not in values:
         raise ConfigError(
             f"{key} is missing",
             key=key,
             hint="give RA, DEC and SR in decimal degrees, such as RA=83.6&DEC=-5.4&SR=1",
         )
     try:
-        value = float(given[key]) if "_" not in given[key] else math.nan
+        value = float(values[key]) if "_" not in values[key] else math.nan
     except ValueError:
         value = math.nan
     if not least <= value <= most:
-        told = f"give decimal degrees from {least:g} to {most:g}"
-        raise parameter_error(key, given[key], told)
+        advice = f"give decimal degrees from {least:g} to {most:g}"
+        raise parameter_error(key, values[key], advice)
     return value
 
 
@@ -152,11 +152,11 @@ def _form(text: str) -> tuple[Format, str]:
 
 
 def _whole(
-    given: Mapping[str, str], key: str, usual: int | None, least: int, most: int | None
+    values: Mapping[str, str], key: str, usual: int | None, least: int, most: int | None
 ) -> int | None:
-    if not given.get(key):
+    if not values.get(key):
         return usual
-    text = given[key]
+    text = values[key]
     is_number = text.isascii() and text.isdigit() and len(text) < 19
     if not is_number or int(text) < least or (most is not None and int(text) > most):
         upto = "" if most is None else f" to {most}"

@@ -83,14 +83,14 @@ _EXAMPLES = (
     (
         "cone",
         "Stars within 10 degrees of a place, the brightest first",
-        "SELECT *, DISTANCE({place}, POINT('ICRS', 83.6, -5.4)) AS separation_deg FROM {stars} "
-        "WHERE 1 = CONTAINS({place}, CIRCLE('ICRS', 83.6, -5.4, 10)) ORDER BY mag",
+        "SELECT *, DISTANCE({point}, POINT('ICRS', 83.6, -5.4)) AS separation_deg FROM {stars} "
+        "WHERE 1 = CONTAINS({point}, CIRCLE('ICRS', 83.6, -5.4, 10)) ORDER BY mag",
     ),
     (
         "polygon",
         "Stars within a polygon",
         "SELECT TOP 100 * FROM {stars} "
-        "WHERE 1 = CONTAINS({place}, POLYGON('ICRS', 70, -20, 110, -20, 90, 20))",
+        "WHERE 1 = CONTAINS({point}, POLYGON('ICRS', 70, -20, 110, -20, 90, 20))",
     ),
     (
         "counts",
@@ -129,14 +129,14 @@ def capabilities(base_url: str, limits: ServiceLimits) -> bytes:
         (f"{_VOSI}tables-1.1", "tables", "1.1"),
         ("ivo://ivoa.net/std/DALI#examples", "examples", None),
     ]
-    found: list[Capability] = [
+    vosi: list[Capability] = [
         Capability(
             standard_id=AnyUrl(name), interface=[_interface(f"{base_url}/{path}", "full", version)]
         )
         for name, path, version in others
     ]
-    made = VOSICapabilities(capability=[_table_access(base_url, limits), *found])
-    return document(made, skip_empty=True)
+    model = VOSICapabilities(capability=[_table_access(base_url, limits), *vosi])
+    return document(model, skip_empty=True)
 
 
 def _table_access(base_url: str, limits: ServiceLimits) -> TableAccess:
@@ -153,7 +153,8 @@ def _table_access(base_url: str, limits: ServiceLimits) -> TableAccess:
             LanguageFeatureList(
                 type=kind if ":" in kind else f"{_FEATURES}{kind}",
                 feature=[
-                    LanguageFeature(form=form, description=told or None) for form, told in forms
+                    LanguageFeature(form=form, description=description or None)
+                    for form, description in forms
                 ],
             )
             for kind, forms in LANGUAGE_FEATURES
@@ -164,11 +165,14 @@ def _table_access(base_url: str, limits: ServiceLimits) -> TableAccess:
         language=[language],
         output_format=[
             OutputFormat(
-                mime=one.tap_type,
-                alias=[one.name, *(a for a in one.aliases if "/" not in a or ";" not in a)],
-                ivo_id=one.standard_id or None,
+                mime=tap_format.tap_type,
+                alias=[
+                    tap_format.name,
+                    *(a for a in tap_format.aliases if "/" not in a or ";" not in a),
+                ],
+                ivo_id=tap_format.standard_id or None,
             )
-            for one in TAP_FORMATS
+            for tap_format in TAP_FORMATS
         ],
         upload_method=[
             UploadMethod(ivo_id=f"ivo://ivoa.net/std/TAPRegExt#upload-{kind}")
@@ -209,8 +213,8 @@ def for_tap_plus(tables: bytes) -> bytes:
 
 def table_document(table: TapTable) -> bytes:
     """Return a table with its columns."""
-    made = _described(VOSITable(**_about(table, True)), table.description)
-    return document(made, skip_empty=True)
+    model = _described(VOSITable(**_about(table, True)), table.description)
+    return document(model, skip_empty=True)
 
 
 def _schema(schema: Schema, with_columns: bool) -> TableSchema:
@@ -218,8 +222,8 @@ def _schema(schema: Schema, with_columns: bool) -> TableSchema:
         _described(TableElement(**_about(table, with_columns)), table.description)
         for table in schema.tables
     ]
-    found = TableSchema(schema_name=adql_name(schema.name), table=tables)
-    return _described(found, schema.description)
+    model = TableSchema(schema_name=adql_name(schema.name), table=tables)
+    return _described(model, schema.description)
 
 
 def _described(element: Element, text: str) -> Element:
@@ -234,15 +238,15 @@ def _about(table: TapTable, with_columns: bool) -> dict[str, Any]:
         return about
     columns = [
         _Column(
-            column_name=adql_name(one.name),
-            description=one.description or None,
-            unit=one.unit or None,
-            ucd=one.ucd or None,
-            xtype=one.xtype or None,
-            datatype=DataType(value=one.datatype, arraysize=one.arraysize or None),
-            flag=_flags(one),
+            column_name=adql_name(column.name),
+            description=column.description or None,
+            unit=column.unit or None,
+            ucd=column.ucd or None,
+            xtype=column.xtype or None,
+            datatype=DataType(value=column.datatype, arraysize=column.arraysize or None),
+            flag=_flags(column),
         )
-        for one in table.columns
+        for column in table.columns
     ]
     keys = [
         ForeignKey(
@@ -277,19 +281,21 @@ def examples(tables: Tables) -> list[tuple[str, str, str]]:
     with_places = [table for table in tables if _has(table, *POSITION, "mag")]
     # The table of rejected stars also has positions.
     stars = min(with_places, key=lambda table: table.name != "stars", default=None)
-    place = f"POINT('ICRS', {', '.join(map(adql_name, POSITION))})"
-    chosen = [one for one in _EXAMPLES if stars is not None or "{stars}" not in one[2]]
+    point = f"POINT('ICRS', {', '.join(map(adql_name, POSITION))})"
+    runnable = [
+        example for example in _EXAMPLES if stars is not None or "{stars}" not in example[2]
+    ]
     name = full_name(stars) if stars is not None else ""
-    return [(word, told, query.format(stars=name, place=place)) for word, told, query in chosen]
+    return [(word, title, query.format(stars=name, point=point)) for word, title, query in runnable]
 
 
 def examples_page(tables: Tables) -> str:
     """Return a page with the examples."""
     parts = "\n".join(
         f'<div typeof="example" id="{name}" resource="#{name}">\n'
-        f'<h2 property="name">{html_escape(told)}</h2>\n'
+        f'<h2 property="name">{html_escape(title)}</h2>\n'
         f'<pre property="query">{html_escape(query)}</pre>\n</div>'
-        for name, told, query in examples(tables)
+        for name, title, query in examples(tables)
     )
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n<!DOCTYPE html>\n'

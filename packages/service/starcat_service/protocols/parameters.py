@@ -48,14 +48,14 @@ class TapQuestion:
 class Parameters:
     """Parameters of a request, in the order in which they came."""
 
-    def __init__(self, given: Iterable[tuple[str, str]]) -> None:
-        self._given = [(name.upper(), value) for name, value in given]
+    def __init__(self, pairs: Iterable[tuple[str, str]]) -> None:
+        self._pairs = [(name.upper(), value) for name, value in pairs]
 
     def all(self, name: str) -> list[str]:
         """Return all values of a parameter that are not empty."""
-        return [value for one, value in self._given if one == name and value != ""]
+        return [value for key, value in self._pairs if key == name and value != ""]
 
-    def one(self, name: str) -> str | None:
+    def value(self, name: str) -> str | None:
         """Return the value of a parameter."""
         values = list(dict.fromkeys(self.all(name)))
         if len(values) > 1:
@@ -69,25 +69,25 @@ class Parameters:
 
     def items(self) -> list[tuple[str, str]]:
         """Return names, in capitals, and values."""
-        return list(self._given)
+        return list(self._pairs)
 
 
-def parameter_error(key: str, value: str | None, told: str) -> ConfigError:
+def parameter_error(key: str, value: str | None, advice: str) -> ConfigError:
     """Return the error of a value of a parameter."""
-    return ConfigError(f"{key} is {quoted(value or '')}; {told}", key=key, value=value)
+    return ConfigError(f"{key} is {quoted(value or '')}; {advice}", key=key, value=value)
 
 
-def question(given: Parameters, most_rows: int) -> TapQuestion:
+def question(parameters: Parameters, most_rows: int) -> TapQuestion:
     """Return what a request asks."""
-    request = given.one("REQUEST")
+    request = parameters.value("REQUEST")
     if request not in (None, "doQuery"):
         raise parameter_error("REQUEST", request, "it may be doQuery only, or be left out")
-    language = given.one("LANG")
+    language = parameters.value("LANG")
     if language is not None and language.upper() not in LANGUAGES:
         raise parameter_error(
             "LANG", language, f"queries are written in one of {', '.join(LANGUAGES)}"
         )
-    query = given.one("QUERY")
+    query = parameters.value("QUERY")
     if query is None:
         raise ConfigError(
             "QUERY is missing; it has the query in ADQL, such as SELECT * FROM tap_schema.tables",
@@ -95,10 +95,10 @@ def question(given: Parameters, most_rows: int) -> TapQuestion:
         )
     return TapQuestion(
         query,
-        response_format(given.one("RESPONSEFORMAT") or given.one("FORMAT")),
-        max_rows(given.one("MAXREC"), most_rows),
-        uploads(given.all("UPLOAD")),
-        given.one("RUNID") or "",
+        response_format(parameters.value("RESPONSEFORMAT") or parameters.value("FORMAT")),
+        max_rows(parameters.value("MAXREC"), most_rows),
+        uploads(parameters.all("UPLOAD")),
+        parameters.value("RUNID") or "",
     )
 
 
@@ -111,11 +111,11 @@ def max_rows(text: str | None, most: int) -> int:
     return most if len(text) > len(str(most)) + 10 else min(int(text), most)
 
 
-def uploads(given: list[str]) -> tuple[Upload, ...]:
+def uploads(values: list[str]) -> tuple[Upload, ...]:
     """Return the tables that a request uploads."""
-    found: list[Upload] = []
-    for pair in (pair for value in given for pair in value.split(";") if pair.strip()):
-        name, comma, place = (word.strip() for word in pair.partition(","))
+    tables: list[Upload] = []
+    for pair in (pair for value in values for pair in value.split(";") if pair.strip()):
+        name, comma, location = (word.strip() for word in pair.partition(","))
         if not comma or not _TABLE_NAME.fullmatch(name):
             raise parameter_error(
                 "UPLOAD",
@@ -123,24 +123,25 @@ def uploads(given: list[str]) -> tuple[Upload, ...]:
                 "it is a name of letters, digits and underscores, a "
                 "comma and param: with the name of a part of the request",
             )
-        scheme, _, part = place.partition(":")
-        result = _RESULT.fullmatch(place)
+        scheme, _, part = location.partition(":")
+        result = _RESULT.fullmatch(location)
         is_part = scheme.lower() == "param" and part
         if not is_part and not result:
             raise ConfigError(
-                f"UPLOAD of {name} is at {quoted(place)}",
+                f"UPLOAD of {name} is at {quoted(location)}",
                 key="UPLOAD",
-                value=place,
+                value=location,
                 hint="nothing is fetched from elsewhere: send the table in the request and write "
                 f"{literal(name)},param:PART, or give the address of an answer of this service",
             )
-        if name.lower() in [one.table.lower() for one in found]:
+        if name.lower() in [upload.table.lower() for upload in tables]:
             raise ConfigError(
                 f"UPLOAD has {name} twice", key="UPLOAD", hint="give each its own name"
             )
-        found.append(Upload(name, part="" if result else part, job_id=result[1] if result else ""))
-    if len(found) > MAX_UPLOADS:
+        tables.append(Upload(name, part="" if result else part, job_id=result[1] if result else ""))
+    if len(tables) > MAX_UPLOADS:
         raise ConfigError(
-            f"UPLOAD has {len(found)} tables; at most {MAX_UPLOADS} come with a query", key="UPLOAD"
+            f"UPLOAD has {len(tables)} tables; at most {MAX_UPLOADS} come with a query",
+            key="UPLOAD",
         )
-    return tuple(found)
+    return tuple(tables)

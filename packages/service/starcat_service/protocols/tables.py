@@ -62,13 +62,13 @@ class TapColumn:
     @property
     def facts(self) -> dict[str, str]:
         """Its description in the metadata of an Arrow field."""
-        known = {
+        texts = {
             "unit": self.unit,
             "ucd": self.ucd,
             "description": self.description,
             "xtype": self.xtype,
         }
-        return {key: text for key, text in known.items() if text}
+        return {key: text for key, text in texts.items() if text}
 
     def named(self, name: str) -> TapColumn:
         """Return the same column under another name."""
@@ -119,7 +119,7 @@ class Tables:
 
     def __init__(self, schemas: tuple[Schema, ...]) -> None:
         self.schemas = schemas
-        self._found = {(t.schema.lower(), t.name.lower()): t for t in self}
+        self._by_name = {(t.schema.lower(), t.name.lower()): t for t in self}
 
     def __iter__(self) -> Iterator[TapTable]:
         """Go through all tables."""
@@ -130,12 +130,12 @@ class Tables:
         """Return these tables, and the tables of another schema."""
         return Tables((*self.schemas, schema))
 
-    def chosen(self, names: Sequence[str]) -> Tables:
+    def subset(self, names: Sequence[str]) -> Tables:
         """Return some of the tables."""
-        wanted = {name.strip().replace('"', "").lower() for name in names}
+        lower_names = {name.strip().replace('"', "").lower() for name in names}
         schemas = []
         for schema in self.schemas:
-            kept = tuple(t for t in schema.tables if f"{t.schema}.{t.name}".lower() in wanted)
+            kept = tuple(t for t in schema.tables if f"{t.schema}.{t.name}".lower() in lower_names)
             if kept:
                 schemas.append(replace(schema, tables=kept))
         return Tables(tuple(schemas))
@@ -143,12 +143,12 @@ class Tables:
     def find(self, schema: str, name: str) -> TapTable | None:
         """Return a table."""
         if schema:
-            return self._found.get((schema.lower(), name.lower()))
+            return self._by_name.get((schema.lower(), name.lower()))
         named = [
             table
-            for one in self.schemas
-            for table in one.tables
-            if not one.is_alias and table.name.lower() == name.lower()
+            for candidate in self.schemas
+            for table in candidate.tables
+            if not candidate.is_alias and table.name.lower() == name.lower()
         ]
         return named[0] if len(named) == 1 else None
 
@@ -279,8 +279,8 @@ def own_schema() -> Schema:
             NAME,
             name,
             tuple(
-                TapColumn(column, *kind, description=told, is_standard=True)
-                for column, (kind, told) in columns.items()
+                TapColumn(column, *kind, description=description, is_standard=True)
+                for column, (kind, description) in columns.items()
             ),
             _ABOUT[name],
             _KEYS.get(name, ()),
@@ -293,26 +293,26 @@ def own_schema() -> Schema:
 
 def session_schemas(session: Session, about: Mapping[str, str]) -> tuple[Schema, ...]:
     """Return the schemas of the targets of a session: each under its own name and its alias."""
-    found = []
+    schemas = []
     for target in session.targets:
         tables = tuple(_table(session, target.name, view) for view in target.views)
-        told = about.get(target.name, "")
-        found.append(Schema(target.name, told, tables))
+        description = about.get(target.name, "")
+        schemas.append(Schema(target.name, description, tables))
         if target.alias:
             same = tuple(replace(table, schema=target.alias) for table in tables)
-            told = f"The newest version: the tables of {target.name}. {told}"
-            found.append(Schema(target.alias, told, same, is_alias=True))
-    return tuple(sorted(found, key=lambda schema: schema.name))
+            description = f"The newest version: the tables of {target.name}. {description}"
+            schemas.append(Schema(target.alias, description, same, is_alias=True))
+    return tuple(sorted(schemas, key=lambda schema: schema.name))
 
 
 def _table(session: Session, schema: str, view: View) -> TapTable:
     with session.ask(f'SELECT * FROM "{schema}"."{view.name}"') as asked:
-        found = asked.columns
-    known = facts_by_name([view])
+        kinds = asked.columns
+    view_facts = facts_by_name([view])
     first = view.schema.order[:1] if view.schema else ()
     columns = []
-    for name, kind in found:
-        facts = column_facts(name, known)
+    for name, kind in kinds:
+        facts = column_facts(name, view_facts)
         columns.append(
             TapColumn(
                 name,
@@ -360,14 +360,19 @@ def _rows(tables: Tables) -> dict[str, list[dict[str, object]]]:
     for number, schema in enumerate(tables.schemas):
         name = adql_name(schema.name)
         rows["schemas"].append(_row(schema, schema_name=name, schema_index=number))
-        for place, table in enumerate(schema.tables):
-            own = full_name(table)
-            facts = {"schema_name": name, "table_name": own, "table_type": "table"}
-            rows["tables"].append(_row(table, **facts, table_index=place))
+        for table_number, table in enumerate(schema.tables):
+            table_name = full_name(table)
+            facts = {"schema_name": name, "table_name": table_name, "table_type": "table"}
+            rows["tables"].append(_row(table, **facts, table_index=table_number))
             rows["columns"] += _column_rows(table)
-            for one, key in enumerate(table.keys):
-                named = {"key_id": f"{table.schema}.{table.name}.{one}", "from_column": key.column}
-                rows["keys"].append(_row(key, **named, from_table=own, target_table=key.target))
+            for key_number, key in enumerate(table.keys):
+                named = {
+                    "key_id": f"{table.schema}.{table.name}.{key_number}",
+                    "from_column": key.column,
+                }
+                rows["keys"].append(
+                    _row(key, **named, from_table=table_name, target_table=key.target)
+                )
                 rows["key_columns"].append(_row(key, **named))
     return rows
 
@@ -381,9 +386,9 @@ def _column_rows(table: TapTable) -> list[dict[str, object]]:
             indexed=int(column.is_indexed),
             principal=int(column.is_principal),
             std=int(column.is_standard),
-            column_index=place,
+            column_index=number,
         )
-        for place, column in enumerate(table.columns)
+        for number, column in enumerate(table.columns)
     ]
 
 

@@ -37,8 +37,8 @@ def upload_facts(path: str, name: str, folder: str) -> dict[str, Any]:
     _Inspection(Path(path), name).check()
     table = _parsed(Path(path), name)
     arrays, columns = [], []
-    for place, field in zip(table.array.dtype.names, table.fields, strict=True):
-        values = _arrow(table.array[place], field.name, name)
+    for array_name, field in zip(table.array.dtype.names, table.fields, strict=True):
+        values = _arrow(table.array[array_name], field.name, name)
         if field.xtype == "timestamp":
             values = _times(values)
         kind = values.type
@@ -46,16 +46,18 @@ def upload_facts(path: str, name: str, folder: str) -> dict[str, Any]:
         datatype = ARROW_DATATYPES.get(kind.value_type if is_list else kind, "char")
         size = "*" if is_list or datatype in ("char", "unicodeChar") else ""
         arrays.append(values)
-        told = " ".join(str(field.description or "").split())
+        description = " ".join(str(field.description or "").split())
         unit = str(field.unit) if field.unit is not None else ""
         columns.append(
-            TapColumn(field.name, datatype, size, field.xtype or "", unit, field.ucd or "", told)
+            TapColumn(
+                field.name, datatype, size, field.xtype or "", unit, field.ucd or "", description
+            )
         )
     names = [column.name for column in columns]
     _check_names(names, name)
     pq.write_table(pa.table(arrays, names=names), Path(folder) / f"{name}.parquet")
-    told = f"The uploaded table {name}"
-    return asdict(TapTable(UPLOADS, name, tuple(columns), told, view=identifier(name)))
+    description = f"The uploaded table {name}"
+    return asdict(TapTable(UPLOADS, name, tuple(columns), description, view=identifier(name)))
 
 
 def table_of_facts(facts: dict[str, Any]) -> TapTable:
@@ -79,14 +81,14 @@ def _parsed(path: Path, name: str) -> Any:
             with path.open("rb") as stream:
                 table = parse_single_table(stream, verify="warn")
     except W51 as error:
-        found = re.search(r"Value '(.{1,60}).*' is out of range for a (\S+)", str(error))
-        what = f"{found[1]}, which a {found[2]} integer cannot hold" if found else str(error)
+        match = re.search(r"Value '(.{1,60}).*' is out of range for a (\S+)", str(error))
+        what = f"{match[1]}, which a {match[2]} integer cannot hold" if match else str(error)
         raise _refusal(
             name, f"has the value {what}", "give its FIELD a wider datatype: long, double or char"
         ) from error
     except Exception as error:  # astropy can raise anything for a file of a user
-        told = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-        raise _refusal(name, f"cannot be read as a VOTable ({told})") from error
+        message = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise _refusal(name, f"cannot be read as a VOTable ({message})") from error
     if not table.fields:
         raise _refusal(name, "has no columns")
     return table
@@ -97,16 +99,16 @@ def _arrow(values: Any, field: str, name: str) -> pa.Array:
     mask = np.ma.getmaskarray(values)
     if data.dtype.kind in "SUO" and not _is_list(data):
         is_null = mask if mask.ndim == 1 else mask.reshape(len(mask), -1).all(axis=1)
-        texts = (None if one is None else _text(one) for one in data)
+        texts = (None if value is None else _text(value) for value in data)
         return pa.array(texts, pa.string(), mask=is_null)
     if data.dtype.kind not in "biufO":
         raise _refusal(name, f"column {quoted(field)} has values of type {data.dtype}")
     if data.ndim > 1 or data.dtype.kind == "O":
-        lists = [np.ma.filled(np.ma.asarray(one), 0).ravel() for one in data]
+        lists = [np.ma.filled(np.ma.asarray(row), 0).ravel() for row in data]
         item = pa.from_numpy_dtype(lists[0].dtype) if lists else pa.float64()
-        return pa.array([one.tolist() for one in lists], pa.list_(_item(item)))
-    found = pa.array(np.ascontiguousarray(data.astype(data.dtype.newbyteorder("="))), mask=mask)
-    return found.cast(_item(found.type))
+        return pa.array([row.tolist() for row in lists], pa.list_(_item(item)))
+    array = pa.array(np.ascontiguousarray(data.astype(data.dtype.newbyteorder("="))), mask=mask)
+    return array.cast(_item(array.type))
 
 
 def _times(values: pa.Array) -> pa.Array:
@@ -123,7 +125,7 @@ def _item(kind: pa.DataType) -> pa.DataType:
 
 def _is_list(data: Any) -> bool:
     """Return whether objects are arrays of numbers, not texts."""
-    return data.dtype.kind == "O" and any(isinstance(one, np.ndarray) for one in data[:100])
+    return data.dtype.kind == "O" and any(isinstance(value, np.ndarray) for value in data[:100])
 
 
 def _text(value: object) -> str:
@@ -197,5 +199,5 @@ def _width(attributes: dict[str, str]) -> int:
     return total
 
 
-def _refusal(name: str, told: str, advice: str = "send a VOTable") -> ConfigError:
-    return ConfigError(f"UPLOAD {name}: the table {told}", key="UPLOAD", hint=advice)
+def _refusal(name: str, problem: str, advice: str = "send a VOTable") -> ConfigError:
+    return ConfigError(f"UPLOAD {name}: the table {problem}", key="UPLOAD", hint=advice)

@@ -107,7 +107,7 @@ def results_document(job: JobFacts, url: str) -> bytes:
 
 def jobs_document(jobs: Sequence[JobFacts], url: str) -> bytes:
     """Return a list of jobs."""
-    found = [
+    descriptions = [
         ShortJobDescription(
             job_id=job.job_id,
             phase=ExecutionPhase(job.phase),
@@ -118,7 +118,7 @@ def jobs_document(jobs: Sequence[JobFacts], url: str) -> bytes:
         )
         for job in jobs
     ]
-    return document(Jobs(jobref=found))
+    return document(Jobs(jobref=descriptions))
 
 
 def _parameters(job: JobFacts) -> _Parameters:
@@ -144,5 +144,5 @@ def _time(seconds: float | None) -> UTCTimestamp | None:
 
 def document(model: BaseXmlModel, skip_empty: bool = False) -> bytes:
     """Return a document of vo-models as XML."""
-    found = model.to_xml(skip_empty=skip_empty, encoding="UTF-8", xml_declaration=True)
-    return found if isinstance(found, bytes) else found.encode()
+    xml = model.to_xml(skip_empty=skip_empty, encoding="UTF-8", xml_declaration=True)
+    return xml if isinstance(xml, bytes) else xml.encode()

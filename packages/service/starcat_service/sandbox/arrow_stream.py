@@ -57,9 +57,9 @@ def streams_of(batch: pa.RecordBatch, max_bytes: int) -> Iterator[bytes]:
     rows = max(1, batch.num_rows // max(1, parts))
     for start in range(0, batch.num_rows, rows):
         part = batch.slice(start, rows)
-        found = stream_of(batch.schema, part)
-        if len(found) <= max_bytes:
-            yield found
+        stream = stream_of(batch.schema, part)
+        if len(stream) <= max_bytes:
+            yield stream
         elif part.num_rows == 1:
             raise RowTooLarge
         else:
@@ -129,12 +129,16 @@ def _check_values(values: pa.Array, most: int) -> None:
     if isinstance(kind, pa.BaseExtensionType):
         _check_values(values.storage, most)
     elif pa.types.is_dictionary(kind):
-        known = values.dictionary
-        _check_values(known, most)
+        dictionary = values.dictionary
+        _check_values(dictionary, most)
         longest = 0
-        if len(known):
-            is_text = pa.types.is_string(known.type) or pa.types.is_binary(known.type)
-            longest = (pc.max(pc.binary_length(known)).as_py() or 0) if is_text else known.nbytes
+        if len(dictionary):
+            is_text = pa.types.is_string(dictionary.type) or pa.types.is_binary(dictionary.type)
+            longest = (
+                (pc.max(pc.binary_length(dictionary)).as_py() or 0)
+                if is_text
+                else dictionary.nbytes
+            )
         if longest * len(values) > MAX_DICTIONARY_BYTES:
             raise ValueError("values of a dictionary are too long")
     elif pa.types.is_map(kind):
@@ -188,14 +192,14 @@ def _table(data: bytes, at: int, number: int) -> int:
     """Return the start of a table that is a field of another table, in a FlatBuffer."""
     if at == 0:
         [at] = struct.unpack_from("<I", data, 0)
-    place = _field(data, at, number)
-    if not place:
+    offset = _field(data, at, number)
+    if not offset:
         raise ValueError("a message lacks a field")
-    return place + int(struct.unpack_from("<I", data, place)[0])
+    return offset + int(struct.unpack_from("<I", data, offset)[0])
 
 
 def _field(data: bytes, at: int, number: int) -> int:
-    """Return the place of a field of a table, 0 if the table does not have it."""
+    """Return the offset of a field of a table, 0 if the table does not have it."""
     fields = at - struct.unpack_from("<i", data, at)[0]
     if fields < 0:
         raise ValueError("a message has a wrong table")

@@ -38,10 +38,10 @@ class Channel:
 
         OSError if the parent process is gone.
         """
-        found = content if isinstance(content, bytes) else json_content(content)
+        payload = content if isinstance(content, bytes) else json_content(content)
         with self.sending:
-            self._replies.write(HEAD.pack(kind.encode(), len(found)))
-            self._replies.write(found)
+            self._replies.write(HEAD.pack(kind.encode(), len(payload)))
+            self._replies.write(payload)
             if not more:
                 self._replies.flush()
 
@@ -51,10 +51,10 @@ class Channel:
             pass
 
     def _exactly(self, size: int) -> bytes:
-        found = sys.stdin.buffer.read(size)
-        if len(found) < size:
+        data = sys.stdin.buffer.read(size)
+        if len(data) < size:
             raise EOFError
-        return found
+        return data
 
 
 _ARENA_MAX, _ARENAS = -8, 2

@@ -81,14 +81,14 @@ def limit_time(more_s: float) -> None:
         resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
 
 
-def _lower(kind: int, wanted: int) -> None:
+def _lower(kind: int, limit: int) -> None:
     """Set a limit permanently, unless a lower limit exists."""
     if sys.platform == "win32":
         return
     _, hard = resource.getrlimit(kind)
-    if hard in (resource.RLIM_INFINITY, -1) or wanted < hard:
+    if hard in (resource.RLIM_INFINITY, -1) or limit < hard:
         try:
-            resource.setrlimit(kind, (wanted, wanted))
+            resource.setrlimit(kind, (limit, limit))
         except (OSError, ValueError):  # macOS has the limit but refuses to set it
             return
 

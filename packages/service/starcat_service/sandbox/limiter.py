@@ -1,8 +1,8 @@
 """Limits of the work at the same time, for one client and for all together.
 
-Waiting clients are served in turn: a place is given to the client who holds the fewest; a client
-that was served goes behind the others. A client gets another place only if more places are free
-than it holds, so that one client cannot hold all places when others come.
+Waiting clients are served in turn: a slot is given to the client who holds the fewest; a client
+that was served goes behind the others. A client gets another slot only if more slots are free
+than it holds, so that one client cannot hold all slots when others come.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ asker: ContextVar[str] = ContextVar("asker", default="")
 T = TypeVar("T")
 
 
-class Place:
-    """A place that is held while anything uses it, even beyond the end of a request."""
+class Slot:
+    """A slot that is occupied while anything uses it, even beyond the end of a request."""
 
     def __init__(self, release: Callable[[], None]) -> None:
         self._release = release
@@ -44,7 +44,7 @@ class Place:
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """Keep the place meanwhile; it is returned when nothing uses it any more."""
+        """Keep the slot meanwhile; it is returned when nothing uses it any more."""
         with self._lock:
             self._users += 1
         try:
@@ -58,64 +58,64 @@ class Place:
 
 
 class Limiter:
-    """A number of places for all clients together, of which one client can hold ``each``.
+    """A number of slots for all clients together, of which one client can hold ``each``.
 
     With ``max_waiting``, a client that has so many requests waiting is refused at once.
     """
 
     def __init__(self, count: int, each: int, max_waiting: int | None = None) -> None:
         self._free, self._each, self._max_waiting = count, max(1, each), max_waiting
-        self._held: Counter[str] = Counter()
-        self._waiting: list[tuple[str, Future[Place]]] = []
+        self._used: Counter[str] = Counter()
+        self._waiting: list[tuple[str, Future[Slot]]] = []
         self._lock = threading.Lock()
-        self.place: ContextVar[Place | None] = ContextVar("place", default=None)  # per request
+        self.slot: ContextVar[Slot | None] = ContextVar("slot", default=None)  # per request
 
     @contextmanager
-    def held(self, who: str, patience_s: float) -> Iterator[None]:
-        """Hold a place in this thread; raise a `Problem` if none is free in time."""
-        wanted = self._wanted(who)
+    def hold(self, who: str, patience_s: float) -> Iterator[None]:
+        """Hold a slot in this thread; raise a `Problem` if none is free in time."""
+        future = self._enqueue(who)
         try:
-            place = wanted.result(patience_s)
+            slot = future.result(patience_s)
         except OutOfTime:
-            place = self._given_up(who, wanted, patience_s)
-        with place.used():
+            slot = self._stop_waiting(who, future, patience_s)
+        with slot.used():
             yield
 
     @asynccontextmanager
     async def turn(self, patience_s: float) -> AsyncIterator[None]:
-        """Hold a place meanwhile; waiting for it takes no thread."""
+        """Hold a slot meanwhile; waiting for it takes no thread."""
         who = asker.get()
-        wanted = self._wanted(who)
+        future = self._enqueue(who)
         try:
-            async with asyncio.timeout(None if wanted.done() else patience_s):
-                place = await asyncio.shield(asyncio.wrap_future(wanted))
+            async with asyncio.timeout(None if future.done() else patience_s):
+                slot = await asyncio.shield(asyncio.wrap_future(future))
         except TimeoutError:
-            place = self._given_up(who, wanted, patience_s)
+            slot = self._stop_waiting(who, future, patience_s)
         except BaseException:
-            if not wanted.cancel():
+            if not future.cancel():
                 self._release(who)
             raise
-        with place.used():
-            token = self.place.set(place)
+        with slot.used():
+            token = self.slot.set(slot)
             try:
                 yield
             finally:
-                self.place.reset(token)
+                self.slot.reset(token)
 
     async def run(self, patience_s: float, call: Callable[[], T]) -> T:
-        """Call a function in a thread when a place is free."""
+        """Call a function in a thread when a slot is free."""
         async with self.turn(patience_s):
             return await in_thread(call)
 
-    def _wanted(self, who: str) -> Future[Place]:
-        wanted: Future[Place] = Future()
+    def _enqueue(self, who: str) -> Future[Slot]:
+        future: Future[Slot] = Future()
         with self._lock:
-            self._waiting.append((who, wanted))
+            self._waiting.append((who, future))
             self._give()
-            waiting = sum(one == who for one, _ in self._waiting)
-            if wanted.done() or self._max_waiting is None or waiting <= self._max_waiting:
-                return wanted
-            wanted.cancel()
+            waiting = sum(waiter == who for waiter, _ in self._waiting)
+            if future.done() or self._max_waiting is None or waiting <= self._max_waiting:
+                return future
+            future.cancel()
             self._give()
         raise Problem(
             503,
@@ -124,36 +124,38 @@ class Limiter:
             headers={"Retry-After": str(RETRY_S)},
         )
 
-    def _given_up(self, who: str, wanted: Future[Place], waited_s: float) -> Place:
-        """Stop waiting: return a place that was given meanwhile, or raise an error."""
-        if not wanted.cancel():
-            return wanted.result()
-        own = self._held[who]
+    def _stop_waiting(self, who: str, future: Future[Slot], waited_s: float) -> Slot:
+        """Stop waiting: return a slot that was given meanwhile, or raise an error."""
+        if not future.cancel():
+            return future.result()
+        used = self._used[who]
         after = "ask again later"
         why = f"the service was busy for {waited_s:g} s: too many requests at once; {after}"
-        if own:
-            why = f"{own} of your requests took more than {waited_s:g} s; {after}, one at a time"
-        raise Problem(429 if own else 503, why, headers={"Retry-After": "10"})
+        if used:
+            why = f"{used} of your requests took more than {waited_s:g} s; {after}, one at a time"
+        raise Problem(429 if used else 503, why, headers={"Retry-After": "10"})
 
     def _release(self, who: str) -> None:
         with self._lock:
             self._free += 1
-            self._held[who] -= 1
+            self._used[who] -= 1
             self._give()
 
     def _give(self) -> None:
-        waiting = [one for one in self._waiting if not one[1].cancelled()]
-        while able := [one for one in waiting if self._held[one[0]] < min(self._each, self._free)]:
-            who, wanted = chosen = min(able, key=lambda one: self._held[one[0]])
-            waiting.remove(chosen)
-            waiting.sort(key=lambda one: one[0] == who)  # the others come first
-            if wanted.set_running_or_notify_cancel():
+        waiting = [entry for entry in self._waiting if not entry[1].cancelled()]
+        while able := [
+            entry for entry in waiting if self._used[entry[0]] < min(self._each, self._free)
+        ]:
+            who, future = first = min(able, key=lambda entry: self._used[entry[0]])
+            waiting.remove(first)
+            waiting.sort(key=lambda entry: entry[0] == who)  # the others come first
+            if future.set_running_or_notify_cancel():
                 self._free -= 1
-                self._held[who] += 1
-                wanted.set_result(Place(partial(self._release, who)))
-        self._waiting, self._held = waiting, +self._held
+                self._used[who] += 1
+                future.set_result(Slot(partial(self._release, who)))
+        self._waiting, self._used = waiting, +self._used
 
 
 async def in_thread(call: Callable[[], T]) -> T:
-    """Call a function in a thread; the limit is the place that the caller holds."""
+    """Call a function in a thread; the limit is the slot that the caller holds."""
     return await to_thread.run_sync(call, limiter=CapacityLimiter(1))

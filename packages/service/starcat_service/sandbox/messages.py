@@ -38,9 +38,9 @@ class MalformedMessage(QueryError):  # noqa: N818 - the name reads as the fact
     """A process sent bytes that are not a message, or a message that is too long."""
 
 
-def json_content(found: Any) -> bytes:
+def json_content(value: Any) -> bytes:
     """Return plain values as the content of a message."""
-    return _JSON.encode(found).encode()
+    return _JSON.encode(value).encode()
 
 
 def from_json(content: bytes | bytearray) -> Any:
@@ -81,13 +81,13 @@ def error_of(content: Any) -> Exception:
         kind, problem, number = str(content["kind"]), str(content["problem"]), content["errno"]
         if number is not None:
             return OSError(int(number), problem)
-        found = error_from_fields(content)
+        reported = error_from_fields(content)
     except (TypeError, ValueError, LookupError) as error:
         return malformed(error)
     for plain in PLAIN_ERRORS:
         if kind == plain.__name__:
             return plain(problem)
-    return found or RuntimeError(f"{kind}: {problem}")
+    return reported or RuntimeError(f"{kind}: {problem}")
 
 
 def _system_error(error: BaseException) -> int | None:

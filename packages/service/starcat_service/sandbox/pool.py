@@ -22,15 +22,15 @@ from starcat_service.sandbox.query_engine import ConfinedEngine, warm_up
 from starcat_service.security.request_limits import reserved, spare_gib
 from starcat_service.settings import ServiceSettings
 
-SHORT_PLACES = 6
+SHORT_SLOTS = 6
 """Short queries that run at the same time, in addition to `Settings.queries` long ones."""
 
 SHORT_S = 0.25
 """Processor seconds after which a query has lower priority."""
 
-IDLE = 2 * SHORT_PLACES
+IDLE = 2 * SHORT_SLOTS
 """Query sessions that are kept while idle; those unused for longest are closed first. SQL and TAP
-use different sessions of a database, and each can need all places for a moment."""
+use different sessions of a database, and each can need all slots for a moment."""
 
 STARVED = 3.0
 """A query ends after this multiple of its time if a busy machine left it little processor time."""
@@ -91,7 +91,7 @@ class Pool(Generic[K, ProcessT]):
         self._begin, self._max_idle, self._harmless = begin, max_idle, harmless
         self._idle: list[Lent[K, ProcessT]] = []
         self._lent: list[Lent[K, ProcessT]] = []
-        self._wanted: Counter[K] = Counter()  # requests that wait for a process
+        self._waiting: Counter[K] = Counter()  # requests that wait for a process
         self._beginning: Counter[K] = Counter()  # processes that are being started
         self._failed: dict[K, list[BaseException]] = {}  # why some could not be started
         self._changed = threading.Condition()
@@ -117,8 +117,8 @@ class Pool(Generic[K, ProcessT]):
     def forget(self, is_gone: Callable[[K], bool]) -> None:
         """Close the idle processes whose key fits."""
         with self._changed:
-            gone = [one for one in self._idle if is_gone(one[0])]
-            self._idle[:] = [one for one in self._idle if one not in gone]
+            gone = [lent for lent in self._idle if is_gone(lent[0])]
+            self._idle[:] = [lent for lent in self._idle if lent not in gone]
         _close(gone)
 
     def close(self) -> None:
@@ -132,51 +132,53 @@ class Pool(Generic[K, ProcessT]):
     def _obtained(self, key: K) -> Lent[K, ProcessT]:
         """Return the first process that is free: one that is given back, or a new one."""
         with self._changed:
-            is_used = self._beginning[key] or any(one[0] == key for one in self._lent)
+            is_used = self._beginning[key] or any(other[0] == key for other in self._lent)
             begins_s = time.monotonic() + (BACK_S if is_used else 0.0)
-            self._wanted[key] += 1
+            self._waiting[key] += 1
             try:
-                while (found := self._idle_one(key)) is None:
+                while (lent := self._idle_process(key)) is None:
                     if self._failed.get(key):
                         raise self._failed[key].pop()
-                    left_s = begins_s - time.monotonic()
-                    if left_s > 0.0:
-                        self._changed.wait(left_s)
+                    wait_s = begins_s - time.monotonic()
+                    if wait_s > 0.0:
+                        self._changed.wait(wait_s)
                         continue
-                    if self._beginning[key] < min(self._wanted[key], BEGINNING):
+                    if self._beginning[key] < min(self._waiting[key], BEGINNING):
                         self._beginning[key] += 1
-                        threading.Thread(target=self._begin_one, args=(key,), daemon=True).start()
+                        threading.Thread(
+                            target=self._begin_process, args=(key,), daemon=True
+                        ).start()
                     self._changed.wait()
             finally:
-                self._wanted -= Counter((key,))
-                if not self._wanted[key]:
+                self._waiting -= Counter((key,))
+                if not self._waiting[key]:
                     self._failed.pop(key, None)
-            self._lent.append(found)
-            return found
+            self._lent.append(lent)
+            return lent
 
-    def _begin_one(self, key: K) -> None:
-        made: Lent[K, ProcessT] | BaseException
+    def _begin_process(self, key: K) -> None:
+        started: Lent[K, ProcessT] | BaseException
         try:
             with ExitStack() as closing:
-                made = key, closing.enter_context(self._begin(key)), closing.pop_all()
+                started = key, closing.enter_context(self._begin(key)), closing.pop_all()
         except BaseException as error:
-            made = error
+            started = error
         with self._changed:
             self._beginning -= Counter((key,))
-            if isinstance(made, BaseException):
-                if self._wanted[key]:
-                    self._failed.setdefault(key, []).append(made)
+            if isinstance(started, BaseException):
+                if self._waiting[key]:
+                    self._failed.setdefault(key, []).append(started)
                 self._changed.notify_all()
                 return
-        self._keep(made, True)
+        self._keep(started, True)
 
-    def _idle_one(self, key: K) -> Lent[K, ProcessT] | None:
+    def _idle_process(self, key: K) -> Lent[K, ProcessT] | None:
         for number in range(len(self._idle) - 1, -1, -1):
             if self._idle[number][0] == key:
-                found = self._idle.pop(number)
-                if found[1].is_running:
-                    return found
-                _close([found])
+                lent = self._idle.pop(number)
+                if lent[1].is_running:
+                    return lent
+                _close([lent])
         return None
 
     def _keep(self, lent: Lent[K, ProcessT], is_reusable: bool) -> None:
@@ -185,7 +187,7 @@ class Pool(Generic[K, ProcessT]):
         with self._changed:
             if is_reusable:
                 self._idle.append(lent)
-            most = self._wanted[lent[0]] + (0 if self._is_closed else self._max_idle)
+            most = self._waiting[lent[0]] + (0 if self._is_closed else self._max_idle)
             while len(self._idle) > most:
                 gone.append(self._idle.pop(0))
             self._changed.notify_all()
@@ -204,7 +206,7 @@ class QueryPool:
     """Query sessions, which are kept for the next query about the same targets.
 
     Each is a process of its own (`ConfinedEngine`); `run` calls what uses `session` in a thread,
-    when there is a place for it.
+    when a slot is free for it.
     """
 
     def __init__(self, settings: ServiceSettings) -> None:
@@ -217,13 +219,13 @@ class QueryPool:
         self._settings = settings
         # Below the root: its disk is monitored, and the folder is emptied at each start.
         self._scratch = ServicePaths(settings.root).scratch
-        self._places = SHORT_PLACES + settings.queries
-        self._limiter = Limiter(self._places, self._places // 4)
+        self._slots = SHORT_SLOTS + settings.queries
+        self._limiter = Limiter(self._slots, self._slots // 4)
         self._open: Pool[Key, Session] = Pool(self._begin, IDLE, (QueryError,))
         self.close = self._open.close
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in a thread when a place is free for it."""
+        """Call a function in a thread when a slot is free for it."""
         return await self._limiter.run(self._limits.time_s, partial(function, *args, **kwargs))
 
     @contextmanager
@@ -235,17 +237,17 @@ class QueryPool:
         All of its queries together have one time limit.
         """
         limits = replace(self._limits, time_s=time_s or self._limits.time_s)
-        place = self._limiter.place.get()
+        slot = self._limiter.slot.get()
         allowance = Allowance(limits.time_s, SHORT_S, STARVED)
         try:
             with (
-                nullcontext() if place is None else place.used(),
-                self._open.lend(tuple(map(_identity, targets))) as one,
-                reserved(self._settings, round(1e9 * one.limits.disk_gb)),
+                nullcontext() if slot is None else slot.used(),
+                self._open.lend(tuple(map(_identity, targets))) as session,
+                reserved(self._settings, round(1e9 * session.limits.disk_gb)),
             ):
-                yield replace(one, limits=limits, allowance=allowance)
+                yield replace(session, limits=limits, allowance=allowance)
         except StarcatError as error:
-            gone = [Path(one).name for one in targets if not Path(one).exists()]
+            gone = [Path(target).name for target in targets if not Path(target).exists()]
             if not gone:
                 raise
             raise TargetMissing(
@@ -261,8 +263,8 @@ class QueryPool:
     def _begin(self, key: Key) -> Iterator[Session]:
         make_folder(self._scratch)
         targets = [text for text, *_ in key]
-        # All places together take at most half of the space that may be used.
-        spare_gb = spare_gib(self._settings) * GIB_IN_GB / (2 * self._places)
+        # All slots together take at most half of the space that may be used.
+        spare_gb = spare_gib(self._settings) * GIB_IN_GB / (2 * self._slots)
         limits = replace(self._limits, disk_gb=min(DISK_GB, max(MIN_DISK_GB, spare_gb)))
         with open_session(
             targets, limits, within=self._scratch, new_engine=self._new_engine
@@ -274,7 +276,7 @@ class QueryPool:
 def _identity(target: str | Path) -> tuple[str, int, int]:
     """Return an identity of a target that changes if the target is replaced."""
     try:
-        found = Path(target).stat()
+        stat = Path(target).stat()
     except OSError:
         return str(target), 0, 0
-    return str(target), found.st_ino, found.st_mtime_ns
+    return str(target), stat.st_ino, stat.st_mtime_ns

@@ -98,15 +98,15 @@ class WorkerProcess:
         OSError if the process ended, TimeoutError if it takes longer (`time.monotonic`).
         """
         content = json_content(request)
-        left = memoryview(HEAD.pack(REQUEST.encode(), len(content)) + content)
+        unsent = memoryview(HEAD.pack(REQUEST.encode(), len(content)) + content)
         if os.name != "posix":
-            self._requests.write(left)
+            self._requests.write(unsent)
             self._requests.flush()
             return
-        while left:
+        while unsent:
             try:
                 descriptor = self._requests.fileno()
-                left = left[os.write(descriptor, left) :]
+                unsent = unsent[os.write(descriptor, unsent) :]
             except BlockingIOError:
                 waiting = select.poll()
                 waiting.register(descriptor, select.POLLOUT)
@@ -125,7 +125,7 @@ class WorkerProcess:
         EOFError if the process ended, `MalformedMessage` if its message is too long.
         """
         until_s = time.monotonic() + wait_s
-        while (found := self._next()) is None:
+        while (message := self._next()) is None:
             wait_s = max(0.0, min(LOOK_S, until_s - time.monotonic()))
             # Its output is in the pipe before it ends; other processes may keep the pipe open.
             is_over = not self.is_running
@@ -140,7 +140,7 @@ class WorkerProcess:
                 raise EOFError
             else:
                 self._received += part
-        return found
+        return message
 
     def _next(self) -> tuple[str, bytes | bytearray] | None:
         """Return the next message from the received bytes, if it is complete."""
@@ -191,10 +191,10 @@ class WorkerProcess:
         try:
             if os.name == "posix":
                 os.set_blocking(self._process.stderr.fileno(), False)
-            found = os.read(self._process.stderr.fileno(), MAX_WORDS_BYTES)
+            output = os.read(self._process.stderr.fileno(), MAX_WORDS_BYTES)
         except (OSError, ValueError):
             return []
-        return found.decode(errors="replace").strip().splitlines()
+        return output.decode(errors="replace").strip().splitlines()
 
     def used_s(self) -> float:
         """Return its processor time, or the time of the clock if that cannot be read."""

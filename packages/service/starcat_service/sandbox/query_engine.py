@@ -194,8 +194,7 @@ class ConfinedEngine:
                 self._process = self._started()
                 if self._opened is not None:
                     self._answered("open", self._opened, Allowance(OPENING_S))
-            given = allowance or Allowance(OPENING_S)
-            return self._answered(name, arguments, given, progress)
+            return self._answered(name, arguments, allowance or Allowance(OPENING_S), progress)
 
     def _started(self) -> WorkerProcess:
         shutil.rmtree(self._opening.spill, ignore_errors=True)
@@ -218,21 +217,21 @@ class ConfinedEngine:
         progress: Progress = no_progress,
     ) -> list[Any]:
         try:
-            given = [encoded(argument) for argument in arguments]
+            values = [encoded(argument) for argument in arguments]
         except Exception as error:  # a user's own class can raise anything
             raise QueryError(f"a value of the query cannot be passed on: {error}") from error
         parts: list[Any] = []
         is_over = False
         begun_s, used_s = time.monotonic(), self._process.used_s()
         try:
-            self._process.send([name, allowance.left_s, given], begun_s + allowance.left_s)
+            self._process.send([name, allowance.left_s, values], begun_s + allowance.left_s)
             for kind, content in self._replies(allowance, begun_s, used_s):
                 if kind == PROGRESS:
                     progress("query", _percent(content), 100)
                 elif kind == ERROR:
-                    found = from_json(content)
-                    is_over = isinstance(found, dict) and found.get("is_last") is False
-                    raise _query_error(error_of(found))
+                    reported = from_json(content)
+                    is_over = isinstance(reported, dict) and reported.get("is_last") is False
+                    raise _query_error(error_of(reported))
                 elif kind == PART:
                     parts.append(decoded_rows(content))
                 else:
@@ -322,10 +321,10 @@ def _query_error(error: Exception) -> QueryError:
 
 
 def _percent(content: bytes | bytearray) -> int:
-    found = from_json(content)
-    if not isinstance(found, int):
+    percent = from_json(content)
+    if not isinstance(percent, int):
         raise MalformedMessage("the process of the query sent a progress that is not a number")
-    return min(max(found, 0), 100)
+    return min(max(percent, 0), 100)
 
 
 def _common_folder(files: Sequence[str]) -> str:

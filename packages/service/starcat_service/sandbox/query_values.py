@@ -73,9 +73,9 @@ def encoded_rows(rows: Sequence[Sequence[Any]], types: Sequence[str]) -> bytes:
 def decoded_rows(content: bytes | bytearray) -> list[tuple[Any, ...]]:
     """Return the rows of a message; MalformedMessage if there are none in it."""
     end = content.find(b"\n") % (len(content) + 1)
-    found = from_json(content[:end])
+    header = from_json(content[:end])
     try:
-        count, columns, sizes = found
+        count, columns, sizes = header
         packed, view = [], memoryview(content)
         for size in sizes:
             if not 0 <= size < len(content) - end:
@@ -98,8 +98,8 @@ def _encoded_column(column: Sequence[Any], kind: str, packed: list[bytes]) -> li
     if code is not None:
         nulls = [k for k, value in enumerate(column) if value is None] if None in column else []
         try:
-            given = [0 if value is None else value for value in column] if nulls else column
-            packed.append(struct.pack(f"<{len(column)}{code}", *given))
+            numbers = [0 if value is None else value for value in column] if nulls else column
+            packed.append(struct.pack(f"<{len(column)}{code}", *numbers))
             return [code, nulls]
         except struct.error:  # larger than 64 bits
             pass

@@ -59,20 +59,20 @@ class Sandbox:
         self.close = self._children.close
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function that uses tasks in a thread, when there is a place for it."""
+        """Call a function that uses tasks in a thread, when a slot is free for it."""
         return await self._limiter.run(WAIT_S, partial(function, *args, **kwargs))
 
     def call(self, task: str, arguments: Mapping[str, Any]) -> Any:
         """Do a task of `starcat_service.sandbox.worker.TASKS`; its error is raised here."""
         if task in WRITING:
             check_disk(self._settings)
-        has_place = self._limiter.place.get() is not None
-        place = nullcontext() if has_place else self._limiter.held(asker.get(), WAIT_S)
+        has_slot = self._limiter.slot.get() is not None
+        slot = nullcontext() if has_slot else self._limiter.hold(asker.get(), WAIT_S)
         try:
-            with place, self._children.lend(None) as worker:
+            with slot, self._children.lend(None) as worker:
                 kind, content = self._answer(worker, [task, dict(arguments), self._time_s])
-                found = from_json(content)
-                error = None if kind == DONE else error_of(found)
+                answer = from_json(content)
+                error = None if kind == DONE else error_of(answer)
                 # A process that ran out of memory or stack is not used again.
                 if isinstance(error, (MemoryError, RecursionError)):
                     raise error
@@ -89,13 +89,13 @@ class Sandbox:
             ) from None
         if error is not None:
             raise error
-        return found
+        return answer
 
     def convert(self, source: Path, target: Path, form: str, label: Label | None = None) -> None:
         """Convert an Arrow stream into a file of some format; some need the table in memory."""
-        given = {"source": str(source), "target": str(target), "form": form}
+        arguments = {"source": str(source), "target": str(target), "form": form}
         try:
-            self.call("convert", {**given, "label": None if label is None else asdict(label)})
+            self.call("convert", {**arguments, "label": None if label is None else asdict(label)})
         except _OutOfMemory:
             others = [name for name in FILE_FORMATS if name not in WHOLE_FORMATS]
             raise Problem(

@@ -47,22 +47,22 @@ def identify_confined(
     from starcat.matcher import IdentifyOptions
 
     os.chdir(folder)  # so that messages contain only the name of the file
-    chosen = IdentifyOptions(**options)
+    identify_options = IdentifyOptions(**options)
     # Options that do not concern the matcher must not open another one.
-    matcher = _matcher(database, chosen.search())
+    matcher = _matcher(database, identify_options.search())
     if either_way:
-        answers, found = identify_either_way(Path(file), matcher, chosen)
+        answers, frame_answers = identify_either_way(Path(file), matcher, identify_options)
     else:
-        answers = answer_file(Path(file), matcher, chosen)
-        found = list(answers)
-    if picture is not None and found:
-        answers.draw(Path(f"picture.{picture}"), found[0])
+        answers = answer_file(Path(file), matcher, identify_options)
+        frame_answers = list(answers)
+    if picture is not None and frame_answers:
+        answers.draw(Path(f"picture.{picture}"), frame_answers[0])
     return {
         "database": answers.matcher.database.name,
         "method": answers.matcher.settings.method,
-        "frames": [answer.content() for answer in found],
-        "notes": answers.notes(found[0] if found else None),
-        "more": [_for_page(answers, answer) for answer in found] if for_page else [],
+        "frames": [answer.content() for answer in frame_answers],
+        "notes": answers.notes(frame_answers[0] if frame_answers else None),
+        "more": [_for_page(answers, answer) for answer in frame_answers] if for_page else [],
         "size_px": [answers.camera.width_px, answers.camera.height_px],
     }
 
@@ -106,8 +106,8 @@ def make_flight_image(
     from starcat.ship.exchange import export_image
 
     options: dict[str, Any] = {"method": method, "endian": endian, "profile": profile}
-    made = export_image(Path(database), "onboard", Path(target), **options)
-    return len(made.made.data)
+    image = export_image(Path(database), "onboard", Path(target), **options)
+    return len(image.made.data)
 
 
 def first_camera_confined(folder: str, files: list[str], blind: str) -> dict[str, Any]:
@@ -116,12 +116,12 @@ def first_camera_confined(folder: str, files: list[str], blind: str) -> dict[str
     from starcat.pipeline import FIELDS_DEG, first_camera
 
     os.chdir(folder)
-    found = first_camera(_matcher(blind, SearchOptions()), list(map(Path, files)), FIELDS_DEG)
+    camera = first_camera(_matcher(blind, SearchOptions()), list(map(Path, files)), FIELDS_DEG)
     return {
-        "camera": found.spec_camera.model_dump(mode="json"),
-        "noise_px": found.noise_px,
-        "reach_mag": found.reach_mag,
-        "remarks": found.remarks("G"),
+        "camera": camera.spec_camera.model_dump(mode="json"),
+        "noise_px": camera.noise_px,
+        "reach_mag": camera.reach_mag,
+        "remarks": camera.remarks("G"),
     }
 
 

@@ -37,7 +37,7 @@ from starcat_service.security.request_limits import OWN_CONNECTIONS, BodyLimits,
 from starcat_service.settings import ServiceSettings
 
 ID_HEADER = "X-Request-ID"
-GIVEN_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 """Form of ids of requests from a proxy; a request with any other id gets a new one."""
 
 POLICY = (
@@ -127,8 +127,8 @@ class RequestContext(_HttpMiddleware):
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        given = Headers(scope=scope).get(ID_HEADER, "")
-        name = given if GIVEN_ID.fullmatch(given) else secrets.token_hex(8)
+        header = Headers(scope=scope).get(ID_HEADER, "")
+        name = header if REQUEST_ID.fullmatch(header) else secrets.token_hex(8)
         begun_s, status, sent, is_endless = time.perf_counter(), 0, 0, False
 
         async def send_counted(message: Message) -> None:
@@ -214,7 +214,7 @@ class Refusals(_HttpMiddleware):
             try:
                 for check in self._checks:
                     check(scope)
-                counted.enter_context(self._shares.one(asker.get()))
+                counted.enter_context(self._shares.counted(asker.get()))
                 limited = self._limits.limited(scope, receive)
             except Problem as problem:
                 await as_json(problem)(scope, receive, send)

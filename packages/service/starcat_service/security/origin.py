@@ -40,10 +40,10 @@ class Origins:
 
     def _misdirected(self, headers: Headers) -> Problem | None:
         hosts = headers.getlist("host")
-        found = HOST.fullmatch(hosts[0]) if len(hosts) == 1 else None
-        if found is None:
+        host = HOST.fullmatch(hosts[0]) if len(hosts) == 1 else None
+        if host is None:
             return Problem(400, "the header Host is missing, given twice, or no name of a host")
-        if self._names is None or is_known(found["name"], self._names):
+        if self._names is None or is_known(host["name"], self._names):
             return None
         return Problem(
             421,
@@ -57,10 +57,10 @@ class Origins:
             return _other_site()
         origin = headers.get("origin")
         if origin is not None:
-            own = {f"{scheme}://{headers['host'].lower()}"}
+            origins = {f"{scheme}://{headers['host'].lower()}"}
             if self._settings.public_url is not None:
-                own.add(self._settings.public_url.lower().rstrip("/"))
-            return None if origin.lower() in own else _other_site()
+                origins.add(self._settings.public_url.lower().rstrip("/"))
+            return None if origin.lower() in origins else _other_site()
         if site is None and session_in(headers.get("cookie", ""), self._settings) is not None:
             return Problem(
                 403,

@@ -62,19 +62,19 @@ class Buckets:
         self._per_s = per_minute / 60.0
         self._size = per_minute
         self._clock = clock
-        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()
         self._lock = threading.Lock()
 
     def take(self, key: str) -> float:
         """Take one out of the bucket of a key."""
         with self._lock:  # some handlers run in threads
             now_s = self._clock()
-            left, then_s = self._left.pop(key, (self._size, now_s))
-            left = min(self._size, left + (now_s - then_s) * self._per_s)
-            wait_s = 0.0 if left >= 1.0 else (1.0 - left) / self._per_s
-            self._left[key] = (left if wait_s else left - 1.0), now_s
-            if len(self._left) > MAX_BUCKETS:
-                self._left.popitem(last=False)
+            level, then_s = self._levels.pop(key, (self._size, now_s))
+            level = min(self._size, level + (now_s - then_s) * self._per_s)
+            wait_s = 0.0 if level >= 1.0 else (1.0 - level) / self._per_s
+            self._levels[key] = (level if wait_s else level - 1.0), now_s
+            if len(self._levels) > MAX_BUCKETS:
+                self._levels.popitem(last=False)
             return wait_s
 
 
@@ -86,7 +86,7 @@ class Shares:
         self._running: Counter[str] = Counter()
 
     @contextmanager
-    def one(self, who: str) -> Iterator[None]:
+    def counted(self, who: str) -> Iterator[None]:
         """Count a request while it is answered; raise a `Problem` if there are too many."""
         if self._running[who] >= self._most:
             raise Problem(
@@ -232,9 +232,9 @@ def disk_shortage(settings: ServiceSettings, more_bytes: int = 0) -> str | None:
     free, least = free_gib(settings.root), max(settings.free_gib, MIN_FREE_GIB)
     if free - more_bytes / GIB >= least:
         return None
-    wanted = f", {more_bytes / GIB:.2f} are wanted" if more_bytes else ""
+    need = f", {more_bytes / GIB:.2f} are wanted" if more_bytes else ""
     return (
-        f"the disk of the service has {free:.2f} GiB free{wanted}, and {least:g} have to be left "
+        f"the disk of the service has {free:.2f} GiB free{need}, and {least:g} have to be left "
         "(free_gib); remove unused databases or results, or ask the operator"
     )
 

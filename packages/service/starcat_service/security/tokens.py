@@ -100,23 +100,23 @@ class TokenStore:
     def revoke(self, name: str) -> list[Token]:
         """Invalidate the valid tokens with a name or an id from now on."""
         now_s = time.time()
-        found = [
+        revoked = [
             token
             for token in self.all()
             if name in (token.name, token.id) and token.state(now_s) == "valid"
         ]
-        if not found:
+        if not revoked:
             raise TargetMissing(
                 f"no valid token has the name or id {name[:80]!r}",
                 hint="'starcat token list' lists them",
             )
         with self._records.writing() as connection:
-            for token in found:
+            for token in revoked:
                 connection.execute(
                     "UPDATE tokens SET revoked_s = ? WHERE id = ?", (now_s, token.id)
                 )
                 connection.execute("DELETE FROM sessions WHERE token = ?", (token.id,))
-        return found
+        return revoked
 
     def find(self, text: str) -> Token | None:
         """Return the token of a text."""
@@ -150,7 +150,7 @@ def token_of(row: sqlite3.Row) -> Token:
 
 def _valid(rows: list[sqlite3.Row]) -> Token | None:
     now_s = time.time()
-    return next((one for one in map(token_of, rows) if one.state(now_s) == "valid"), None)
+    return next((token for token in map(token_of, rows) if token.state(now_s) == "valid"), None)
 
 
 def _date(at_s: float | None) -> str | None:

@@ -76,17 +76,21 @@ async def search(catalog: str, request: Request, service: TheService, reader: Re
     used), or the name of a catalog that was read.
     """
     asked = cone_request(request.query_params.multi_items())
-    found = await service.query_pool.run(_answer, service, catalog, asked)
-    return StreamingResponse(file_chunks(found), headers={"Content-Type": asked.media_type})
+    file = await service.query_pool.run(_answer, service, catalog, asked)
+    return StreamingResponse(file_chunks(file), headers={"Content-Type": asked.media_type})
 
 
 def _target_of(service: Service, name: str) -> tuple[Path, Label]:
-    named = [one for one in service.library.databases() if name in (one.id, one.name, one.title)]
+    named = [
+        database
+        for database in service.library.databases()
+        if name in (database.id, database.name, database.title)
+    ]
     if named:
         newest = named[-1]
         return newest.folder, Label("stars", newest.name, newest.version)
     if _NAME.fullmatch(name):
-        for path in _read_ones(service.paths.catalogs, name):
+        for path in _catalog_paths(service.paths.catalogs, name):
             if path.is_file() or (path.is_dir() and is_store(path)):
                 return path, Label(name)
     raise TargetMissing(
@@ -95,12 +99,12 @@ def _target_of(service: Service, name: str) -> tuple[Path, Label]:
     )
 
 
-def _read_ones(folder: Path, name: str) -> list[Path]:
+def _catalog_paths(folder: Path, name: str) -> list[Path]:
     """Return possible files of a catalog that was read: with its name, or with names of jobs."""
-    own = folder / name
+    of_name = folder / name
     of_jobs = [path for path in folder.glob(f"{name}-*") if _OF_A_JOB.match(path.name, len(name))]
     newest_first = sorted(of_jobs, key=lambda path: (-path.stat().st_mtime_ns, path.name))
-    return [own / _STARS, folder / f"{name}.parquet", own, *newest_first]
+    return [of_name / _STARS, folder / f"{name}.parquet", of_name, *newest_first]
 
 
 def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporaryFile[bytes]:
@@ -113,12 +117,12 @@ def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporary
         with session.ask(cone_query(view, asked, maxrec)) as running:
             rows = with_ucds(running.batches(), view)
             chunks = service.tap.chunks(rows, asked.form, maxrec, label)
-            held: SpooledTemporaryFile[bytes]
-            held = SpooledTemporaryFile(HELD_BYTES, dir=str(service.paths.scratch))  # noqa: SIM115
+            file: SpooledTemporaryFile[bytes]
+            file = SpooledTemporaryFile(HELD_BYTES, dir=str(service.paths.scratch))  # noqa: SIM115
             try:
-                held.writelines(chunks)
+                file.writelines(chunks)
             except BaseException:
-                held.close()
+                file.close()
                 raise
-    held.seek(0)
-    return held
+    file.seek(0)
+    return file

@@ -85,8 +85,8 @@ FORM: dict[str, Any] = {
                 "schema": {
                     "type": "object",
                     "properties": {
-                        name: {"type": type_, "description": told, "example": example}
-                        for name, type_, example, told in _PARAMETERS
+                        name: {"type": type_, "description": description, "example": example}
+                        for name, type_, example, description in _PARAMETERS
                     },
                 }
             }
@@ -110,11 +110,11 @@ def in_address(
                 "name": name,
                 "in": "query",
                 "required": name in required,
-                "description": told,
+                "description": description,
                 "schema": {"type": kind},
                 "example": example,
             }
-            for name, kind, example, told in parameters
+            for name, kind, example, description in parameters
         ]
     }
 
@@ -160,18 +160,18 @@ class TapRequest:
 
 async def tap_request(request: Request) -> AsyncIterator[TapRequest]:
     """Yield the parameters of a request; its files exist while it is answered."""
-    given = list(request.query_params.multi_items())
+    pairs = list(request.query_params.multi_items())
     kind = body_type(request)
     if request.method != "POST" or not kind:
-        yield TapRequest(Parameters(given), {})
+        yield TapRequest(Parameters(pairs), {})
         return
     if kind not in _FORMS:
         raise Problem(415, f"the body is {kind[:60]}; send one of {', '.join(_FORMS)}")
     form = await _form(request)
     try:
-        given += [(name, value) for name, value in form.multi_items() if isinstance(value, str)]
-        uploads = {name: one for name, one in form.items() if isinstance(one, UploadFile)}
-        yield TapRequest(Parameters(given), uploads)
+        pairs += [(name, value) for name, value in form.multi_items() if isinstance(value, str)]
+        uploads = {name: value for name, value in form.items() if isinstance(value, UploadFile)}
+        yield TapRequest(Parameters(pairs), uploads)
     finally:
         await form.close()
 
@@ -192,8 +192,8 @@ async def _form(request: Request) -> FormData:
 
 def base_url(request: Request) -> str:
     """Return the address of TAP as the client sees it."""
-    own = service_of(request).settings.public_url or str(request.base_url)
-    return own.rstrip("/") + PREFIX
+    url = service_of(request).settings.public_url or str(request.base_url)
+    return url.rstrip("/") + PREFIX
 
 
 router = APIRouter(prefix=PREFIX, tags=["TAP"], route_class=VOTableRoute)
@@ -303,10 +303,10 @@ async def _joined(first: bytes, rest: Spool) -> AsyncIterator[bytes]:
 @router.post(
     "/sync", summary="Answer a query in ADQL, perhaps about uploaded tables", openapi_extra=FORM
 )
-async def sync(given: TheRequest, service: TheService, who: Reader) -> Response:
+async def sync(query_request: TheRequest, service: TheService, who: Reader) -> Response:
     """Answer a query; parameters as TAP 1.1 has them."""
-    asked = question(given.parameters, service.settings.max_rows)
-    first, rest = await service.query_pool.run(_begun, service, asked, given, who.name)
+    asked = question(query_request.parameters, service.settings.max_rows)
+    first, rest = await service.query_pool.run(_begun, service, asked, query_request, who.name)
     answer = _Closing(first, rest, asked.form.tap_type)
     name = f"result{asked.form.suffix}"
     answer.headers["Content-Disposition"] = f'inline; filename="{name}"'
@@ -314,7 +314,7 @@ async def sync(given: TheRequest, service: TheService, who: Reader) -> Response:
 
 
 def _begun(
-    service: Service, asked: TapQuestion, given: TapRequest, owner: str
+    service: Service, asked: TapQuestion, query_request: TapRequest, owner: str
 ) -> tuple[bytes, Spool]:
     """Return the first part of an answer, and the spool of the other parts."""
     gone = threading.Event()
@@ -323,8 +323,8 @@ def _begun(
         if gone.is_set():
             raise ClientGone
 
-    with scratch_folder(service.paths) if given.uploads else nullcontext() as folder:
-        files = given.keep(folder, service.settings) if folder else {}
+    with scratch_folder(service.paths) if query_request.uploads else nullcontext() as folder:
+        files = query_request.keep(folder, service.settings) if folder else {}
         files |= service.query_jobs.answers(asked.uploads, owner, asker.get())
         parts = service.tap.answer(asked, files, progress=watch)
         # Parameters and uploads have been read before the first part of the answer exists.
@@ -352,17 +352,17 @@ async def get_tables(
     detail: Annotated[Literal["min", "max"], Query(description="min without columns")] = "max",
 ) -> Response:
     """Return schemas, tables and columns."""
-    given = request.query_params
-    has_columns = detail == "max" and given.get("only_tables") != "true"
+    query = request.query_params
+    has_columns = detail == "max" and query.get("only_tables") != "true"
 
     def document() -> bytes:
-        found = service.tap.state().tables
-        chosen = found.chosen(given["tables"].split(",")) if "tables" in given else found
-        return tableset(chosen, has_columns)
+        tables = service.tap.state().tables
+        selected = tables.subset(query["tables"].split(",")) if "tables" in query else tables
+        return tableset(selected, has_columns)
 
     content = await service.query_pool.run(document)
     # TapPlus is the only client that does not send its name.
-    if any(name in given for name in TAP_PLUS) or "user-agent" not in request.headers:
+    if any(name in query for name in TAP_PLUS) or "user-agent" not in request.headers:
         content = for_tap_plus(content)
     return Response(content, headers={"Vary": "User-Agent"}, media_type=MEDIA_TYPE)
 
@@ -371,7 +371,7 @@ async def get_tables(
 async def get_table(name: str, service: TheService, who: Reader) -> Response:
     """Return a table with its columns."""
     state = await service.query_pool.run(service.tap.state)
-    for table in state.tables.chosen([name]):
+    for table in state.tables.subset([name]):
         return Response(table_document(table), media_type=MEDIA_TYPE)
     raise TargetMissing(f"no table {quoted(name)}", hint="/tap/tables lists all tables")
 

@@ -65,24 +65,26 @@ def list_tap_jobs(
                 f"PHASE is {quoted(phase)}; expected one of {', '.join(PHASES)}", key="PHASE"
             )
     since = None if after is None else _seconds("AFTER", after)
-    found = [
+    jobs = [
         job
         for job in service.query_jobs.jobs(who.name, asker.get())
         if (not phases or job.phase in phases) and (since is None or job.created_s > since)
     ]
-    return _xml(jobs_document(found[:last], f"{base_url(request)}/async"))
+    return _xml(jobs_document(jobs[:last], f"{base_url(request)}/async"))
 
 
 @router.post("", summary="Make a job (UWS)", openapi_extra=FORM)
-def make_job(given: TheRequest, request: Request, service: TheService, who: Reader) -> Response:
+def make_job(
+    tap_request: TheRequest, request: Request, service: TheService, who: Reader
+) -> Response:
     """Create a job from the parameters of TAP; with PHASE=RUN it is run."""
-    phase = given.parameters.one("PHASE")
+    phase = tap_request.parameters.value("PHASE")
     if phase not in (None, "RUN"):
         raise ConfigError(f"PHASE is {quoted(phase or '')}; a new job takes RUN only", key="PHASE")
-    kept = [(name, value) for name, value in given.parameters.items() if name != "PHASE"]
+    kept = [(name, value) for name, value in tap_request.parameters.items() if name != "PHASE"]
     job = service.query_jobs.create(who.name)
     try:
-        files = _kept_files(given, service, job)
+        files = _kept_files(tap_request, service, job)
     except Problem:
         service.query_jobs.delete(job.job_id)
         raise
@@ -108,16 +110,18 @@ async def get_job(
 
 
 @router.post("/{job_id}", summary="Delete a job, or set parameters (UWS)")
-def change_job(given: TheRequest, job: TheJob, request: Request, service: TheService) -> Response:
+def change_job(
+    tap_request: TheRequest, job: TheJob, request: Request, service: TheService
+) -> Response:
     """Delete a job with ACTION=DELETE."""
-    action = given.parameters.one("ACTION")
+    action = tap_request.parameters.value("ACTION")
     if action is not None:
         if action.upper() != "DELETE":
             raise ConfigError(f"ACTION is {quoted(action)}; it may be DELETE", key="ACTION")
         return _deleted(request, service, job)
-    if given.parameters.one("PHASE") is not None:
-        return set_phase(given, job, request, service)
-    return set_parameters(given, job, request, service)
+    if tap_request.parameters.value("PHASE") is not None:
+        return set_phase(tap_request, job, request, service)
+    return set_parameters(tap_request, job, request, service)
 
 
 @router.delete("/{job_id}", summary="Delete a job (UWS)")
@@ -133,9 +137,11 @@ def get_phase(job: TheJob) -> Response:
 
 
 @router.post("/{job_id}/phase", summary="Run or abort a job (UWS)")
-def set_phase(given: TheRequest, job: TheJob, request: Request, service: TheService) -> Response:
+def set_phase(
+    tap_request: TheRequest, job: TheJob, request: Request, service: TheService
+) -> Response:
     """Run a job that is pending, or abort one that has not ended."""
-    phase = given.parameters.one("PHASE")
+    phase = tap_request.parameters.value("PHASE")
     if phase == "RUN":
         service.query_jobs.run(job.job_id)
     elif phase == "ABORT":
@@ -152,9 +158,11 @@ def get_limit(job: TheJob) -> Response:
 
 
 @router.post("/{job_id}/executionduration", summary="Set how long a job may run (UWS)")
-def set_limit(given: TheRequest, job: TheJob, request: Request, service: TheService) -> Response:
+def set_limit(
+    tap_request: TheRequest, job: TheJob, request: Request, service: TheService
+) -> Response:
     """Set the time limit in seconds, at most the limit of the service; 0 for that limit."""
-    text = given.parameters.one("EXECUTIONDURATION") or ""
+    text = tap_request.parameters.value("EXECUTIONDURATION") or ""
     try:
         seconds = float(text)
     except ValueError:
@@ -175,10 +183,10 @@ def get_destruction(job: TheJob) -> Response:
 
 @router.post("/{job_id}/destruction", summary="Set when a job goes (UWS)")
 def set_destruction(
-    given: TheRequest, job: TheJob, request: Request, service: TheService
+    tap_request: TheRequest, job: TheJob, request: Request, service: TheService
 ) -> Response:
     """Set the time of deletion, at most as late as the service allows."""
-    text = given.parameters.one("DESTRUCTION") or ""
+    text = tap_request.parameters.value("DESTRUCTION") or ""
     service.query_jobs.set_destruction(job.job_id, _seconds("DESTRUCTION", text))
     return _see(request, job)
 
@@ -203,13 +211,13 @@ def get_parameters(job: TheJob) -> Response:
 
 @router.post("/{job_id}/parameters", summary="Set parameters of a job (UWS)")
 def set_parameters(
-    given: TheRequest, job: TheJob, request: Request, service: TheService
+    tap_request: TheRequest, job: TheJob, request: Request, service: TheService
 ) -> Response:
     """Set parameters of a job that is pending."""
     if job.phase != "PENDING":
         raise ConfigError(f"the job is {job.phase}; parameters are set before it is run")
-    files = _kept_files(given, service, job)
-    service.query_jobs.set_parameters(job.job_id, given.parameters.items(), files)
+    files = _kept_files(tap_request, service, job)
+    service.query_jobs.set_parameters(job.job_id, tap_request.parameters.items(), files)
     return _see(request, job)
 
 
@@ -229,7 +237,10 @@ def get_result(job: TheJob, service: TheService) -> Response:
         raise TargetMissing(
             f"the job is {job.phase} and has no answer until its phase is COMPLETED"
         )
-    suffix = next((one.suffix for one in TAP_FORMATS if one.tap_type == job.media_type), ".vot")
+    suffix = next(
+        (tap_format.suffix for tap_format in TAP_FORMATS if tap_format.tap_type == job.media_type),
+        ".vot",
+    )
     return FileResponse(
         path,
         media_type=job.media_type,
@@ -246,21 +257,21 @@ def get_error(job: TheJob) -> Response:
     return Response(error_votable(job.error), media_type=VOTABLE_TYPE)
 
 
-def _kept_files(given: TapRequest, service: Service, job: JobFacts) -> dict[str, Path]:
+def _kept_files(tap_request: TapRequest, service: Service, job: JobFacts) -> dict[str, Path]:
     """Copy the files of a request into the folder of a job, within the quota of its user."""
-    if given.uploads:
-        service.query_jobs.make_room(job.job_id, 0, given.upload_bytes)
-    return given.keep(service.query_jobs.folder(job.job_id), service.settings)
+    if tap_request.uploads:
+        service.query_jobs.make_room(job.job_id, 0, tap_request.upload_bytes)
+    return tap_request.keep(service.query_jobs.folder(job.job_id), service.settings)
 
 
 async def _changed(service: Service, job: JobFacts, most_s: float) -> JobFacts:
     """Return a job when its phase has changed, or after some time."""
     ends = time.monotonic() + most_s
-    found = job
-    while found.phase == job.phase and job.phase in ACTIVE and time.monotonic() < ends:
+    current = job
+    while current.phase == job.phase and job.phase in ACTIVE and time.monotonic() < ends:
         await asyncio.sleep(LOOK_S)
-        found = service.query_jobs.job(job.job_id)
-    return found
+        current = service.query_jobs.job(job.job_id)
+    return current
 
 
 def _deleted(request: Request, service: Service, job: JobFacts) -> Response:

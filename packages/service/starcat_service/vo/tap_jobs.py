@@ -133,23 +133,25 @@ class QueryJobs:
 
     def answers(self, uploads: Sequence[Upload], owner: str, client: str) -> dict[str, Path]:
         """Return the answers of other jobs that a question uploads, by job id."""
-        found = {}
-        for one in uploads:
-            if one.job_id:
-                phase = self.job(one.job_id, owner, client).phase
-                found[one.job_id] = self.folder(one.job_id) / RESULT
+        paths = {}
+        for upload in uploads:
+            if upload.job_id:
+                phase = self.job(upload.job_id, owner, client).phase
+                paths[upload.job_id] = self.folder(upload.job_id) / RESULT
                 if phase != "COMPLETED":
-                    raise TargetMissing(f"UPLOAD of {one.table}: the job is {phase}, no answer yet")
-        return found
+                    raise TargetMissing(
+                        f"UPLOAD of {upload.table}: the job is {phase}, no answer yet"
+                    )
+        return paths
 
     def set_parameters(
-        self, job_id: str, given: Sequence[tuple[str, str]], files: Mapping[str, Path]
+        self, job_id: str, parameters: Sequence[tuple[str, str]], files: Mapping[str, Path]
     ) -> None:
         """Set parameters of a job that has not been run; others keep their values."""
-        names = {name for name, _ in given}
+        names = {name for name, _ in parameters}
         request = _request(self._row(job_id))
         kept = [(name, value) for name, value in request["parameters"] if name not in names]
-        request["parameters"] = [*kept, *given]
+        request["parameters"] = [*kept, *parameters]
         request["files"] |= {part: path.name for part, path in files.items()}
         request["run_id"] = dict(request["parameters"]).get("RUNID", "")
         self._change(job_id, ("pending",), request=json.dumps(request))
@@ -253,10 +255,10 @@ class QueryJobs:
         rows = self._records.rows(
             "SELECT * FROM jobs WHERE kind = ? AND owner = ? ORDER BY created_s, id", QUERY, owner
         )
-        own = [one for one in rows if _is_of(one, owner, client) and one["id"] != job_id]
-        sizes = {one["id"]: folder_bytes(self.folder(one["id"])) for one in own}
+        jobs_of_user = [job for job in rows if _is_of(job, owner, client) and job["id"] != job_id]
+        sizes = {job["id"]: folder_bytes(self.folder(job["id"])) for job in jobs_of_user}
         others = written + more + (0 if owner == ANONYMOUS else self._quota.database_bytes(owner))
-        ended = [one["id"] for one in own if one["state"] not in ACTIVE]
+        ended = [job["id"] for job in jobs_of_user if job["state"] not in ACTIVE]
 
         def lack(freed: int) -> str | None:
             taken = others + sum(sizes.values()) - freed
@@ -266,7 +268,7 @@ class QueryJobs:
 
         freed = 0
         for count in range(len(ended) + 1):
-            freed = sum(sizes[one] for one in ended[:count])
+            freed = sum(sizes[ended_id] for ended_id in ended[:count])
             if (short := lack(freed)) is None:
                 break
         else:

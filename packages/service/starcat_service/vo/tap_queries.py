@@ -81,37 +81,41 @@ class Tap:
 
     def state(self) -> TapState:
         """Return the current tables."""
-        about = self._found()
+        about = self._names_by_path()
         key = _digest(list(about))
         with self._looking:
-            known = self._state
+            cached = self._state
             # Old files in scratch are removed.
-            if known is None or known[0] != key or not any(known[1].targets[-1].glob("*.parquet")):
-                known = self._state = key, self._looked_at(about, key)
-            return known[1]
+            if (
+                cached is None
+                or cached[0] != key
+                or not any(cached[1].targets[-1].glob("*.parquet"))
+            ):
+                cached = self._state = key, self._looked_at(about, key)
+            return cached[1]
 
-    def _found(self) -> dict[Path, str]:
+    def _names_by_path(self) -> dict[Path, str]:
         """Return the existing databases and catalogs on disk, and their names."""
         # Of two databases with one name and version, the older one keeps its schema.
-        databases = sorted(self._library.databases(), key=lambda one: one.built_ns)
-        found = {
+        databases = sorted(self._library.databases(), key=lambda database: database.built_ns)
+        names = {
             database.folder: f"Guide-star database {database.name}, version {database.version}"
             for database in databases
         }
         for path in sorted(self._paths.catalogs.iterdir()):
             is_table = path.suffix == ".parquet" and not path.stem.endswith("rejected")
             if path.is_file() and is_table:
-                found[path] = f"Stars of the catalog {path.stem}"
+                names[path] = f"Stars of the catalog {path.stem}"
             elif path.is_dir() and (is_store(path) or any(path.glob("*.parquet"))):
-                found[path] = f"Stars of the catalog {path.name}"
-        return found
+                names[path] = f"Stars of the catalog {path.name}"
+        return names
 
     def _looked_at(self, about: dict[Path, str], key: str) -> TapState:
         try:
             return self._opened(about, key)
         except StarcatError as error:
             _logger.warning("a table cannot be shown by TAP: %s", error)
-        return self._opened({path: told for path, told in about.items() if self._opens(path)}, key)
+        return self._opened({path: name for path, name in about.items() if self._opens(path)}, key)
 
     def _opens(self, path: Path) -> bool:
         try:
@@ -121,15 +125,14 @@ class Tap:
             return False
 
     def _opened(self, about: dict[Path, str], key: str) -> TapState:
-        own = own_schema()
         folder = self._paths.scratch / f"tap-{key}" / NAME
         schemas: tuple[Schema, ...] = ()
         if about:
             with self._query_pool.session(list(about)) as session:
                 names = [target.name for target in session.targets]
-                told = dict(zip(names, about.values(), strict=True))
-                schemas = session_schemas(session, told)
-        tables = Tables((*schemas, own))
+                names_of_targets = dict(zip(names, about.values(), strict=True))
+                schemas = session_schemas(session, names_of_targets)
+        tables = Tables((*schemas, own_schema()))
         write_tap_schema(tables, folder)
         return TapState((*about, folder), tables)
 
@@ -174,10 +177,10 @@ class Tap:
         if not uploads:
             yield self.state()
             return
-        for one in uploads:
-            if one.part and one.part not in files:
+        for upload in uploads:
+            if upload.part and upload.part not in files:
                 raise ConfigError(
-                    f"UPLOAD of {one.table}: the request has no file {one.part!r}",
+                    f"UPLOAD of {upload.table}: the request has no file {upload.part!r}",
                     key="UPLOAD",
                     hint="send it as a part of multipart/form-data with that name",
                 )
@@ -185,18 +188,19 @@ class Tap:
             folder = scratch / UPLOADS
             folder.mkdir()
             tables = tuple(
-                self._read(files[one.part or one.job_id], one, folder) for one in uploads
+                self._read(files[upload.part or upload.job_id], upload, folder)
+                for upload in uploads
             )
             uploaded = Schema(UPLOADS, "Tables that came with the query", tables)
             state = self.state()
             yield TapState((*state.targets, folder), state.tables.with_schema(uploaded))
 
     def _read(self, file: Path, upload: Upload, folder: Path) -> TapTable:
-        given = {"path": str(file), "name": upload.table, "folder": str(folder)}
-        return table_of_facts(self._sandbox.call("upload", given))
+        arguments = {"path": str(file), "name": upload.table, "folder": str(folder)}
+        return table_of_facts(self._sandbox.call("upload", arguments))
 
 
 def _digest(paths: list[Path]) -> str:
     """Return a name for a state of the tables."""
-    told = [f"{path}\0{path.stat().st_mtime_ns}" for path in paths]
-    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]
+    stamps = [f"{path}\0{path.stat().st_mtime_ns}" for path in paths]
+    return hashlib.sha256("\n".join(stamps).encode()).hexdigest()[:16]
