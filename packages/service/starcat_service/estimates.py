@@ -143,7 +143,7 @@ class ChildCatalogs:
     async def _in_turn(
         self, key: str, task: str, arguments: Mapping[str, Any], convert: Callable[[Any], T]
     ) -> T:
-        """Return an answer of the process as soon as its user has a place."""
+        """Return an answer of the process as soon as its user has a slot."""
         async with self._limiter.turn(MAX_ANSWER_S):
             running = self._running.get(key)
             if running is None:

@@ -66,30 +66,30 @@ def tables(session: Session) -> Tables:
 def find(session, tables):
     """Return the columns of the answer to a query."""
 
-    def found(text: str) -> dict[str, list[object]]:
+    def answer(text: str) -> dict[str, list[object]]:
         return dict(translate_adql(session, translate(text, tables)).read_all().to_pydict())
 
-    return found
+    return answer
 
 
 @pytest.fixture(scope="module")
 def measured(find):
     """Return numbers of all places, in their order: an array of a row for each expression."""
 
-    def found(*expressions: str) -> Floats:
-        chosen = ", ".join(f"{text} AS c{k}" for k, text in enumerate(expressions))
-        columns = find(f"SELECT {chosen} FROM places ORDER BY row")
+    def numbers(*expressions: str) -> Floats:
+        columns_text = ", ".join(f"{text} AS c{k}" for k, text in enumerate(expressions))
+        columns = find(f"SELECT {columns_text} FROM places ORDER BY row")
         return np.array(list(columns.values()), dtype=np.float64)
 
-    return found
+    return numbers
 
 
 # Geometry against brute force.
 
 
 def apart_deg(places: Floats, ra: float, dec: float) -> Floats:
-    found = angular_separation(*np.radians(places.T), np.radians(ra), np.radians(dec))
-    return np.asarray(np.degrees(found))
+    apart = angular_separation(*np.radians(places.T), np.radians(ra), np.radians(dec))
+    return np.asarray(np.degrees(apart))
 
 
 def star_shaped(seed: int, widest_deg: float = 35.0) -> tuple[Corners, tuple[float, float]]:
@@ -100,8 +100,8 @@ def star_shaped(seed: int, widest_deg: float = 35.0) -> tuple[Corners, tuple[flo
     # No gap between corners is half a turn.
     azimuth = np.radians(360.0 / count) * (np.arange(count) + generator.uniform(0, 0.4, count))
     reach = np.radians(generator.uniform(4.0, widest_deg, count))
-    found = [offset(ra, dec, a, r) for a, r in zip(azimuth, reach, strict=True)]
-    return (found if seed % 2 else found[::-1]), (ra, dec)
+    corners = [offset(ra, dec, a, r) for a, r in zip(azimuth, reach, strict=True)]
+    return (corners if seed % 2 else corners[::-1]), (ra, dec)
 
 
 def offset(ra: float, dec: float, azimuth: float, reach: float) -> tuple[float, float]:
@@ -140,12 +140,12 @@ def edge_points(corners: Corners, each: int = 400) -> Floats:
     """Return places along the sides of a polygon."""
     u = directions_from_radec(*np.array(corners).T)
     parts = np.linspace(0.0, 1.0, each)[:, None]
-    found = np.concatenate(
+    points = np.concatenate(
         [(1 - parts) * a + parts * b for a, b in zip(u, np.roll(u, -1, axis=0), strict=True)]
     )
-    found /= np.linalg.norm(found, axis=1)[:, None]
-    ra = np.degrees(np.arctan2(found[:, 1], found[:, 0]))
-    return np.column_stack([ra, np.degrees(np.arcsin(found[:, 2]))])
+    points /= np.linalg.norm(points, axis=1)[:, None]
+    ra = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    return np.column_stack([ra, np.degrees(np.arcsin(points[:, 2]))])
 
 
 CIRCLES = [
@@ -158,17 +158,17 @@ def test_a_circle_holds_what_is_near(measured, places):
     asked = [
         f"CONTAINS(POINT(ra_deg, dec_deg), CIRCLE({ra}, {dec}, {r}))" for ra, dec, r in CIRCLES
     ]
-    found = measured(*asked)
-    for (ra, dec, radius), answers in zip(CIRCLES, found, strict=True):
+    inside = measured(*asked)
+    for (ra, dec, radius), answers in zip(CIRCLES, inside, strict=True):
         assert np.array_equal(answers == 1, apart_deg(places, ra, dec) <= radius)
         assert set(answers) <= {0.0, 1.0}
 
 
 def test_polygons_hold_what_their_sides_enclose(measured, places):
-    made = [star_shaped(seed) for seed in range(6)]
-    asked = [f"CONTAINS(POINT(ra_deg, dec_deg), {polygon(corners)})" for corners, _ in made]
-    found = measured(*asked)
-    for (corners, centre), answers in zip(made, found, strict=True):
+    shapes = [star_shaped(seed) for seed in range(6)]
+    asked = [f"CONTAINS(POINT(ra_deg, dec_deg), {polygon(corners)})" for corners, _ in shapes]
+    inside = measured(*asked)
+    for (corners, centre), answers in zip(shapes, inside, strict=True):
         expected = within(places, corners, centre)
         assert expected.any()
         assert np.array_equal(answers == 1, expected)
@@ -177,31 +177,31 @@ def test_polygons_hold_what_their_sides_enclose(measured, places):
 def test_polygons_of_columns_are_those_of_numbers(measured):
     corners = [(10.0, -20.0), (50.0, -10.0), (30.0, 40.0)]
     moved = ", ".join(f"{ra} + 0 * row, {dec} + 0 * row" for ra, dec in corners)
-    place = "POINT(ra_deg, dec_deg)"
-    [one, other] = measured(
-        f"CONTAINS({place}, {polygon(corners)})", f"CONTAINS({place}, POLYGON({moved}))"
+    point = "POINT(ra_deg, dec_deg)"
+    [of_numbers, of_columns] = measured(
+        f"CONTAINS({point}, {polygon(corners)})", f"CONTAINS({point}, POLYGON({moved}))"
     )
-    assert np.array_equal(one, other)
-    assert 0 < one.sum() < COUNT
+    assert np.array_equal(of_numbers, of_columns)
+    assert 0 < of_numbers.sum() < COUNT
 
 
 def test_a_box_is_the_polygon_of_its_corners(measured):
     corners = [(30.4, -15.0), (20.4, -15.0), (20.4, -25.0), (30.4, -25.0)]
-    [one, other, area, same] = measured(
+    [in_box, in_polygon, area, same] = measured(
         "CONTAINS(POINT(ra_deg, dec_deg), BOX(25.4, -20.0, 10, 10))",
         f"CONTAINS(POINT(ra_deg, dec_deg), {polygon(corners)})",
         "AREA(BOX('ICRS', POINT(25.4, -20), 10, 10))",
         f"AREA({polygon(corners)})",
     )
-    assert np.array_equal(one, other)
-    assert one.any()
+    assert np.array_equal(in_box, in_polygon)
+    assert in_box.any()
     assert area[0] == pytest.approx(same[0], rel=1e-12)
 
 
 def test_areas_are_sums_of_spherical_triangles(measured):
-    made = [star_shaped(seed) for seed in range(30, 36)]
-    found = measured(*(f"AREA({polygon(corners)})" for corners, _ in made))[:, 0]
-    for (corners, centre), area in zip(made, found, strict=True):
+    shapes = [star_shaped(seed) for seed in range(30, 36)]
+    areas = measured(*(f"AREA({polygon(corners)})" for corners, _ in shapes))[:, 0]
+    for (corners, centre), area in zip(shapes, areas, strict=True):
         turns = zip(corners, corners[1:] + corners[:1], strict=True)
         expected = sum(excess(centre, a, b) for a, b in turns)
         assert area == pytest.approx(np.degrees(np.degrees(expected)), rel=1e-9)
@@ -238,9 +238,9 @@ def test_the_middle_of_a_polygon_is_that_of_its_places(measured):
             f"COORD1(CENTROID({polygon(corners)}))", f"COORD2(CENTROID({polygon(corners)}))"
         )[:, 0]
         mean = everywhere[within(sky, corners, centre)].mean(axis=0)
-        found = directions_from_radec(np.array([lon]), np.array([lat]))[0]
+        middle = directions_from_radec(np.array([lon]), np.array([lat]))[0]
         # Of some thousand places the mean is known to a part of a degree.
-        assert np.degrees(np.arccos(found @ mean / np.linalg.norm(mean))) < 0.5
+        assert np.degrees(np.arccos(middle @ mean / np.linalg.norm(mean))) < 0.5
         assert 0.0 <= lon < 360.0
 
 
@@ -260,9 +260,9 @@ def test_circles_and_polygons_meet_where_their_places_do(measured):
                   f"CONTAINS({shapes[0]}, {shapes[1]})"]  # fmt: skip
         meets = bool(is_inside or nearest <= radius)
         expected += [meets, meets, bool(is_inside and nearest >= radius)]
-    found = measured(*asked)[:, 0]
-    assert np.array_equal(found, expected)
-    assert {0.0, 1.0} == set(found)
+    numbers = measured(*asked)[:, 0]
+    assert np.array_equal(numbers, expected)
+    assert {0.0, 1.0} == set(numbers)
 
 
 def test_polygons_meet_where_their_places_do(measured):
@@ -277,13 +277,13 @@ def test_polygons_meet_where_their_places_do(measured):
         asked += [f"INTERSECTS({polygon(shifted)}, {polygon(corners)})",
                   f"CONTAINS({polygon(shifted)}, {polygon(corners)})"]  # fmt: skip
         expected += [bool(inside.any() or around.any()), bool(inside.all())]
-    found = measured(*asked)[:, 0]
-    assert np.array_equal(found, expected)
-    assert 2 < found.sum() < len(found) - 2
+    numbers = measured(*asked)[:, 0]
+    assert np.array_equal(numbers, expected)
+    assert 2 < numbers.sum() < len(numbers) - 2
 
 
 def test_shapes_within_circles(measured):
-    found = measured(
+    numbers = measured(
         "CONTAINS(CIRCLE(10, 10, 3), CIRCLE(12, 10, 5))",
         "CONTAINS(CIRCLE(10, 10, 3), CIRCLE(14, 10, 5))",
         "INTERSECTS(CIRCLE(10, 10, 3), CIRCLE(17, 10, 5))",
@@ -294,7 +294,7 @@ def test_shapes_within_circles(measured):
         "INTERSECTS(POINT(10, 10), CIRCLE(10, 11, 2))",
         "CONTAINS(CIRCLE(10, 10, 0), POINT(10, 10))",
     )[:, 0]
-    assert found.tolist() == [1, 0, 1, 0, 1, 0, 1, 1, 0]
+    assert numbers.tolist() == [1, 0, 1, 0, 1, 0, 1, 1, 0]
 
 
 def test_a_place_without_numbers_is_nowhere(find):
@@ -304,11 +304,11 @@ def test_a_place_without_numbers_is_nowhere(find):
 
 
 def test_shapes_are_selected_as_dali_writes_them(find):
-    found = find(
+    columns = find(
         "SELECT TOP 1 POINT(1, 2) AS p, CIRCLE('ICRS', 1, 2, 3) AS c, POLYGON(1, 2, 3, 4, 5, 0) "
         "AS s, COORDSYS(POINT('ICRS', 1, 2)) AS f, COORD2(POINT(1, 2)) AS y FROM places"
     )
-    assert found == {"p": [[1, 2]], "c": [[1, 2, 3]], "s": [[1, 2, 3, 4, 5, 0]], "f": ["ICRS"],
+    assert columns == {"p": [[1, 2]], "c": [[1, 2, 3]], "s": [[1, 2, 3, 4, 5, 0]], "f": ["ICRS"],
                      "y": [2.0]}  # fmt: skip
 
 
@@ -317,18 +317,18 @@ def test_shapes_are_selected_as_dali_writes_them(find):
 
 @pytest.mark.parametrize(("text", "expected"), ANSWERED)
 def test_every_query_of_the_table_has_its_answer(find, text, expected):
-    [found] = find(text.replace("⏎", "\n")).values()
+    [answer] = find(text.replace("⏎", "\n")).values()
     values = json.loads(expected)
     if isinstance(values[0], float):
-        assert found == pytest.approx(values, rel=1e-14)
+        assert answer == pytest.approx(values, rel=1e-14)
     else:
-        assert found == values
+        assert answer == values
 
 
 def test_random_numbers_are_between_0_and_1(find):
-    found = np.array(find("SELECT RAND() AS a, RAND(5) AS b FROM places")["a"])
-    assert 0.0 <= found.min() < 0.1
-    assert 0.9 < found.max() < 1.0
+    numbers = np.array(find("SELECT RAND() AS a, RAND(5) AS b FROM places")["a"])
+    assert 0.0 <= numbers.min() < 0.1
+    assert 0.9 < numbers.max() < 1.0
 
 
 def test_galactic_places_are_those_of_astropy(measured, places):
@@ -336,13 +336,13 @@ def test_galactic_places_are_those_of_astropy(measured, places):
     ra, dec = places.T
     sky = SkyCoord(ra, dec, unit="deg").galactic
     centre = SkyCoord(30.0, -10.0, unit="deg", frame="galactic").icrs
-    made = [
+    expressions = [
         "DISTANCE(POINT('GALACTIC', 30, -10), POINT(ra_deg, dec_deg))",
         "DISTANCE(POINT('galactic', ra_deg, dec_deg), POINT('ICRS', 12.5, -40))",
         "CONTAINS(POINT(ra_deg, dec_deg), CIRCLE('GALACTIC', 30, -10, 20))",
         "CONTAINS(POINT(ra_deg, dec_deg), BOX('GALACTIC', 30, 0, 40, 20))",
     ]
-    apart, moved, circle, box = measured(*made)
+    apart, moved, circle, box = measured(*expressions)
     arcsec = 1.0 / 3600.0
     assert np.abs(apart - apart_deg(places, centre.ra.deg, centre.dec.deg)).max() < 0.1 * arcsec
     other = SkyCoord(ra, dec, unit="deg", frame="galactic").icrs
@@ -363,10 +363,10 @@ BOXES = [
 
 def test_boxes_over_the_seam_the_poles_and_the_whole_sky_hold_what_they_say(measured, places):
     ra, dec = places.T
-    found = measured(*(
-        f"CONTAINS(POINT(ra_deg, dec_deg), BOX({', '.join(map(str, one))}))" for one in BOXES
+    inside = measured(*(
+        f"CONTAINS(POINT(ra_deg, dec_deg), BOX({', '.join(map(str, box))}))" for box in BOXES
     ))  # fmt: skip
-    for (lon, lat, width, height), answers in zip(BOXES, found, strict=True):
+    for (lon, lat, width, height), answers in zip(BOXES, inside, strict=True):
         beside = np.abs((ra - lon + 180.0) % 360.0 - 180.0)
         up = np.abs(dec - lat)
         inner = (beside < width / 2.0) & (up < height / 2.0 - 0.5)
@@ -380,18 +380,18 @@ def test_boxes_over_the_seam_the_poles_and_the_whole_sky_hold_what_they_say(meas
 
 
 def test_a_separation_below_a_number_is_what_contains_asks(find, tables):
-    place, other = "POINT(a.ra_deg, a.dec_deg)", "POINT(b.ra_deg, b.dec_deg)"
+    point, other = "POINT(a.ra_deg, a.dec_deg)", "POINT(b.ra_deg, b.dec_deg)"
     query = (
         "SELECT a.row AS i, b.row AS j FROM places AS a JOIN places AS b ON {} "
         "WHERE a.row < 400 ORDER BY i, j"
     )
     forms = [
-        f"1 = CONTAINS({place}, CIRCLE(b.ra_deg, b.dec_deg, 2.5))",
-        f"DISTANCE({place}, {other}) < 2.5",
-        f"DISTANCE({other}, {place}) <= 2.5",
-        f"2.5 > DISTANCE({place}, {other})",
+        f"1 = CONTAINS({point}, CIRCLE(b.ra_deg, b.dec_deg, 2.5))",
+        f"DISTANCE({point}, {other}) < 2.5",
+        f"DISTANCE({other}, {point}) <= 2.5",
+        f"2.5 > DISTANCE({point}, {other})",
         "DISTANCE(a.ra_deg, a.dec_deg, b.ra_deg, b.dec_deg) < 2.5 AND a.row >= 0",
-        f"NOT DISTANCE({place}, {other}) >= 2.5",
+        f"NOT DISTANCE({point}, {other}) >= 2.5",
     ]
     expected = find(query.format(forms[0]))
     assert len(expected["i"]) > 400
@@ -411,19 +411,19 @@ def test_a_separation_below_a_number_is_what_contains_asks(find, tables):
 
 
 def test_units_are_those_that_are_asked_for(measured, places):
-    [found] = measured("IN_UNIT(ra_deg, 'rad')")
-    assert found == pytest.approx(np.radians(places[:, 0]), rel=1e-15)
+    [ra_rad] = measured("IN_UNIT(ra_deg, 'rad')")
+    assert ra_rad == pytest.approx(np.radians(places[:, 0]), rel=1e-15)
 
 
 def test_columns_keep_what_is_known_of_them(session):
     ra = TapColumn("ra_deg", unit="deg", ucd="pos.eq.ra", description="where")
     table = TapTable("places", "places", (ra, TapColumn("row", "long")))
-    known = Tables((Schema("places", "", (table,)),))
+    tables = Tables((Schema("places", "", (table,)),))
     query = (
         "WITH w AS (SELECT ra_deg AS r, row FROM places) SELECT r, r AS other, r + 1, w.*, "
         "MAX(row) AS biggest_deg FROM (SELECT * FROM w) AS w GROUP BY r, row"
     )
-    fields = translate_adql(session, translate(query, known)).schema
+    fields = translate_adql(session, translate(query, tables)).schema
     assert fields.names == ["r", "other", "col_3", "r_2", "row", "biggest_deg"]
     meanings = [(field.metadata or {}).get(b"description") for field in fields]
     assert meanings == [b"where", b"where", None, b"where", None, None]
@@ -442,11 +442,11 @@ REFUSED += [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("text", "told"), REFUSED, ids=range(len(REFUSED)))
-def test_refusals_say_what_and_where(tables, text, told):
+@pytest.mark.parametrize(("text", "words"), REFUSED, ids=range(len(REFUSED)))
+def test_refusals_say_what_and_where(tables, text, words):
     with pytest.raises(QueryError) as caught:
         translate(text, tables)
-    assert told in str(caught.value)
+    assert words in str(caught.value)
 
 
 @pytest.mark.slow

@@ -125,7 +125,7 @@ def looked_at(built: str, page: Page) -> str:
     page.get_by_role("link", name="Build report").click()
     page.wait_for_url("**/report")
     # A report can do nothing, not even what a driver of browsers would have it do.
-    page.complaints = [one for one in page.complaints if "sandboxed" not in one]
+    page.complaints = [complaint for complaint in page.complaints if "sandboxed" not in complaint]
     return built
 
 
@@ -171,9 +171,9 @@ def test_the_sky_and_the_table_tell_the_same_fields(looked_at, page):
     for row in (rows.nth(2), rows.nth(19)):
         number, ra, dec, stars = (row.locator("th, td").nth(k).inner_text() for k in range(4))
         row.locator("th a").click()
-        told = page.locator(".skyview .chosen .what")
-        told.get_by_text(f"Field {number}: {stars} guide stars").wait_for()
-        assert f"RA {ra}, Dec {dec.removeprefix('+')}" in told.inner_text()
+        facts = page.locator(".skyview .chosen .what")
+        facts.get_by_text(f"Field {number}: {stars} guide stars").wait_for()
+        assert f"RA {ra}, Dec {dec.removeprefix('+')}" in facts.inner_text()
     page.mouse.move(0, 0)
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.locator(".skyview .readout", has_text=re.compile("Field|mag")).wait_for()
@@ -185,11 +185,11 @@ def test_a_query_that_fails_is_reported_where_the_answer_would_be(asked, page):
     page.get_by_role("button", name="Run").click()
     page.get_by_role("alert").get_by_text("Table with name star does not exist").wait_for()
     assert page.locator("#answer img").count() == 0
-    page.complaints = [one for one in page.complaints if "400" not in one]
+    page.complaints = [complaint for complaint in page.complaints if "400" not in complaint]
     page.get_by_label("Query").fill("SELECT $hidden AS shown")
     page.get_by_role("button", name="Run").click()
     page.get_by_label("$hidden").wait_for()  # the page was loaded again, with a field for it
-    page.complaints = [one for one in page.complaints if "400" not in one]
+    page.complaints = [complaint for complaint in page.complaints if "400" not in complaint]
 
 
 def test_a_file_is_dropped(identified, page):
@@ -221,30 +221,32 @@ def addresses(job: str, identified: str) -> list[str]:
     sky = "/sql?query=SELECT+designation,ra_deg,dec_deg+FROM+stars+LIMIT+9"
     of_database = ["", "/coverage", "/coverage?field=3&at=10,20,60,0", "/compare", sky]
     frame = f"/identify?database={identified}&seed=7"
-    return [*plain, job, frame, *(database + one for one in [*of_database, "/sql?query=FROM"])]
+    return [*plain, job, frame, *(database + path for path in [*of_database, "/sql?query=FROM"])]
 
 
 @pytest.mark.timeout(400)
 def test_every_page_is_painted_soon_fits_its_window_and_passes_axe(addresses, page):
     """Each is pictured too, for people to look at if STARCAT_SCREENSHOTS names a folder."""
-    folder, found = os.environ.get("STARCAT_SCREENSHOTS"), []
+    folder, complaints = os.environ.get("STARCAT_SCREENSHOTS"), []
     for address in addresses:
         assert min(_paint_ms(page, address)) < MAX_PAINT_MS, address
         if address.startswith("/new"):
             settled(page)
-        found += complaints_of_axe(page)
+        complaints += complaints_of_axe(page)
         if page.locator("main details:not([open])").count():
             every = page.locator("main details")
             every.evaluate_all("all => all.forEach((one) => { one.open = true; })")
-            found += complaints_of_axe(page)
+            complaints += complaints_of_axe(page)
         for theme, width in LOOKS if folder else ():
             look(page, theme, width)
             name = re.sub(r"\W+", "-", address.partition("?")[0]).strip("-") or "start"
             path = Path(folder) / f"{name}-{len(address)}-{width}-{theme}.png"
             page.screenshot(full_page=True, path=path)
         look(page, "light", 1280)
-    page.complaints = [one for one in page.complaints if not re.search("40[04]", one)]
-    assert found == []
+    page.complaints = [
+        complaint for complaint in page.complaints if not re.search("40[04]", complaint)
+    ]
+    assert complaints == []
 
 
 def _paint_ms(page: Page, address: str) -> Iterator[float]:

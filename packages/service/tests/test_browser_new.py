@@ -34,8 +34,8 @@ pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("new")
-    with serve(folder / "service", folder / "log", anonymous="builder") as one:
-        yield one
+    with serve(folder / "service", folder / "log", anonymous="builder") as service:
+        yield service
 
 
 def fill(page: Page, label: str, text: str) -> None:
@@ -100,7 +100,8 @@ def test_task_two_limits_are_compared(page):
     assert colours[0] == colours[1]
     stars = page.locator("dl.figures .figure", has_text="guide stars").first
     now, pinned = (
-        int(re.sub(r"\D", "", stars.locator(one).inner_text())) for one in (".value", ".was")
+        int(re.sub(r"\D", "", stars.locator(selector).inner_text()))
+        for selector in (".value", ".was")
     )
     assert 0 < now < pinned
     page.get_by_role("button", name="Unpin").click()
@@ -162,8 +163,8 @@ def test_enter_in_a_field_updates_the_estimate(page):
 def reading(tmp_path: Path) -> Iterator[tuple[Served, str]]:
     """A service in which everybody may read, and the token of a publisher."""
     token = token_of(tmp_path, "anna")
-    with serve(tmp_path, tmp_path / "log", anonymous="reader") as one:
-        yield one, token
+    with serve(tmp_path, tmp_path / "log", anonymous="reader") as service:
+        yield service, token
 
 
 @pytest.mark.parametrize("name", ["Sign in to build", "Sign in"])
@@ -277,16 +278,16 @@ def test_a_response_is_dropped_and_its_numbers_are_in_the_address(page):
     rows = "".join(f"{nm},{0.001 * (nm - 350)}\n" for nm in range(400, 901, 50))
     file = {"name": "blue sensor.csv", "mimeType": "text/csv", "buffer": rows.encode()}
     page.locator("#response_file").set_input_files([file])
-    own = page.locator("#camera\\.response\\.name")
-    expect(own).to_have_value("blue-sensor", timeout=BUILD_MS)
+    response = page.locator("#camera\\.response\\.name")
+    expect(response).to_have_value("blue-sensor", timeout=BUILD_MS)
     settled(page)
     assert "camera.response.wavelength_nm=" in page.url
     assert page.locator("#response_file").input_value() == ""
     page.goto(page.url)
     settled(page)
-    expect(own).to_have_value("blue-sensor")
+    expect(response).to_have_value("blue-sensor")
     assert page.locator("#sensor-fields").get_attribute("open") is not None
-    own.select_option("")
+    response.select_option("")
     settled(page)
     assert "camera.response" not in page.url
 
@@ -310,7 +311,7 @@ def test_task_another_version_is_built_and_compared(page):
     click(page, page.get_by_role("link", name="Compare"))
     page.get_by_role("heading", name="Side by side").wait_for()
     assert page.clicks <= 6
-    assert [one.split("-")[1] for one in page.locator(".columns h3").all_inner_texts()] == [
+    assert [heading.split("-")[1] for heading in page.locator(".columns h3").all_inner_texts()] == [
         "1.0.0",
         "1.1.0",
     ]

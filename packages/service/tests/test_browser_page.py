@@ -104,4 +104,4 @@ def test_who_signs_in_stays_so_and_manages_tokens(browser, tmp_path, picky_datab
         row.get_by_text("revoked").wait_for()
         assert page.get_by_role("button", name="Revoke the token").count() == 0
         # A report can do nothing, not even what a driver of browsers would have it do.
-        assert [one for one in page.complaints if "sandboxed" not in one] == []
+        assert [complaint for complaint in page.complaints if "sandboxed" not in complaint] == []

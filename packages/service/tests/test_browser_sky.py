@@ -33,8 +33,8 @@ pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 def served(picky_database: Path, tmp_path_factory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("tasks")
     add_database(folder / "service", picky_database)
-    with serve(folder / "service", folder / "log", anonymous="publisher") as one:
-        yield one
+    with serve(folder / "service", folder / "log", anonymous="publisher") as service:
+        yield service
 
 
 def press(page: Page, role: str, name: str | re.Pattern[str]) -> None:
@@ -70,14 +70,14 @@ def test_task_the_weakest_sky(page, picky_database):
     rows = (picky_database / "report" / "coverage.csv").read_text().splitlines()[1:]
     counts = [int(row.split(",")[3]) for row in rows]
     least = min(counts)
-    chosen = page.locator(".chosen .what").inner_text()
-    assert chosen.startswith(f"Field {counts.index(least)}: {least} guide star")
+    field = page.locator(".chosen .what").inner_text()
+    assert field.startswith(f"Field {counts.index(least)}: {least} guide star")
     page.wait_for_url(re.compile(rf"field={counts.index(least)}"))
     kept = page.url
     press(page, "button", "Emptiest field, next")
-    assert page.locator(".chosen .what").inner_text() != chosen
+    assert page.locator(".chosen .what").inner_text() != field
     page.goto(kept)
-    page.locator(".chosen .what", has_text=chosen).wait_for()  # the address keeps the view
+    page.locator(".chosen .what", has_text=field).wait_for()  # the address keeps the view
     page.locator(".chosen a", has_text="Its stars as rows").click()
     page.locator("#answer-count", has_text=f"{least} row").wait_for()
 
@@ -85,18 +85,18 @@ def test_task_the_weakest_sky(page, picky_database):
 def test_the_field_is_in_sight_and_the_way_back_leads_through_the_fields(page):
     page.goto(f"/databases/{DATABASE}/coverage")
     sky_of(page)
-    chosen = page.locator(".skyview .chosen .what")
-    told = []
+    field = page.locator(".skyview .chosen .what")
+    fields = []
     for _ in range(3):
         press(page, "button", "Emptiest field, next")
-        told.append(chosen.inner_text())
+        fields.append(field.inner_text())
         box = page.locator(".skyview canvas").bounding_box()
         assert 0 <= box["y"] < box["y"] + box["height"] <= page.viewport_size["height"]
-    for before in (told[1], told[0]):
+    for before in (fields[1], fields[0]):
         page.go_back()
         page.locator(".skyview .chosen .what", has_text=before).wait_for()
     press(page, "button", "Emptiest field, next")
-    assert chosen.inner_text() == told[1]
+    assert field.inner_text() == fields[1]
 
 
 def test_the_sky_zooms_pans_and_names_its_stars(page):
@@ -128,7 +128,7 @@ def test_the_sky_zooms_pans_and_names_its_stars(page):
     page.goto(f"/databases/{DATABASE}/coverage")
     sky_of(page)
     page.evaluate("window.all = document.querySelector('.skyview').sky.stars")
-    for kind, told in (("guide", "guide star"), ("rejected", "rejected: ")):
+    for kind, words in (("guide", "guide star"), ("rejected", "rejected: ")):
         where = page.evaluate(
             """kind => { const sky = document.querySelector('.skyview').sky;
             const one = window.all.find((star) => star.kind === kind);
@@ -138,7 +138,7 @@ def test_the_sky_zooms_pans_and_names_its_stars(page):
             kind,
         )
         page.mouse.move(where[0], where[1])
-        page.locator(".skyview .readout", has_text=told).wait_for()
+        page.locator(".skyview .readout", has_text=words).wait_for()
         assert where[2] in page.locator(".skyview .readout").inner_text()
         page.mouse.click(where[0], where[1])
         row = page.locator(".chosen a", has_text="Its row").get_attribute("href")
@@ -157,7 +157,7 @@ def test_the_outline_of_a_field_turns_with_the_roll(page):
     first, turned, whole = (page.evaluate(outline, roll) for roll in (0, 30, 360))
     assert first == pytest.approx(whole, abs=1e-9)
     assert first != pytest.approx(turned, abs=0.01)
-    assert sum(one * one for one in turned) == pytest.approx(1.0)
+    assert sum(component * component for component in turned) == pytest.approx(1.0)
 
 
 def test_task_identify_a_picture(page, picture):
@@ -217,7 +217,7 @@ def test_the_table_of_stars_is_not_cut_and_its_rows_sort_and_filter(page):
     assert table.evaluate("t => t.scrollWidth <= t.parentElement.clientWidth")
     press(page, "button", "Magnitude")
     cells = table.locator("tbody tr td:nth-child(2)").all_inner_texts()
-    assert [float(one) for one in cells] == sorted(float(one) for one in cells)
+    assert [float(cell) for cell in cells] == sorted(float(cell) for cell in cells)
     press(page, "button", "Magnitude")
     assert table.locator("tbody tr td:nth-child(2)").all_inner_texts() == cells[::-1]
     first = table.locator(".star-name").first.inner_text()
@@ -297,13 +297,13 @@ def test_the_table_of_a_plan_fits_its_card_and_its_plot_is_dark_in_the_dark(page
     page.locator("summary", has_text="Keep-out angles").click()
     page.get_by_label("Sun").fill("170")
     page.locator("#plan").get_by_role("button", name="Plan").click()
-    found = page.locator("#attitude-table")
-    found.wait_for()
-    assert "Too near, or in the frame" in found.inner_text()
-    assert "Earth" not in found.inner_text(), "there is no orbit"
+    attitudes = page.locator("#attitude-table")
+    attitudes.wait_for()
+    assert "Too near, or in the frame" in attitudes.inner_text()
+    assert "Earth" not in attitudes.inner_text(), "there is no orbit"
     for width in (1100, 1280):
         look(page, "light", width)
-        box = found.evaluate("one => [one.scrollWidth, one.parentElement.clientWidth]")
+        box = attitudes.evaluate("one => [one.scrollWidth, one.parentElement.clientWidth]")
         assert box[0] <= box[1], width
     # A pixel of the margin of the plot, as the browser draws it.
     light = brightness(page)

@@ -64,17 +64,17 @@ def test_a_search_finds_what_brute_force_finds(client, stars):
         answer = ask(client, RA=ra_deg, DEC=dec_deg, SR=sr)
         assert answer.status_code == 200
         assert answer.headers["content-type"] == "text/xml;content=x-votable"
-        found = parse(io.BytesIO(answer.content)).get_first_table().array
-        assert found["designation"].tolist() == near(stars, ra_deg, dec_deg, sr)
-    assert len(found) == len(stars["mag"]) > 300, "the last search is of the whole sky"
-    assert (np.diff(found["separation_deg"].data) >= 0).all()
-    assert sorted(found["mag"].tolist()) == sorted(stars["mag"].tolist())
+        rows = parse(io.BytesIO(answer.content)).get_first_table().array
+        assert rows["designation"].tolist() == near(stars, ra_deg, dec_deg, sr)
+    assert len(rows) == len(stars["mag"]) > 300, "the last search is of the whole sky"
+    assert (np.diff(rows["separation_deg"].data) >= 0).all()
+    assert sorted(rows["mag"].tolist()) == sorted(stars["mag"].tolist())
 
 
 @pytest.mark.parametrize("catalog", ["small", "bright", "faint", "sao", f"{CATALOG}.parquet"])
 def test_a_catalog_has_several_names(client, stars, catalog):
-    found = parse(io.BytesIO(ask(client, catalog).content)).get_first_table().array
-    assert found["designation"].tolist() == near(stars, 83.6, -5.4, 20.0)
+    rows = parse(io.BytesIO(ask(client, catalog).content)).get_first_table().array
+    assert rows["designation"].tolist() == near(stars, 83.6, -5.4, 20.0)
 
 
 def test_verbosity_chooses_columns_with_the_ucds_of_the_standard(client, small_database):
@@ -86,25 +86,25 @@ def test_verbosity_chooses_columns_with_the_ucds_of_the_standard(client, small_d
     assert "source_line" not in names[2]
     every = open_database_folder(small_database).table("stars").column_names
     assert sorted(names[3]) == sorted([*every, "row", "separation_deg"])
-    for chosen in fields.values():
-        [name] = [field for field in chosen if field.ucd == "ID_MAIN"]
+    for columns in fields.values():
+        [name] = [field for field in columns if field.ucd == "ID_MAIN"]
         assert name.datatype in ("char", "unicodeChar")
         for ucd in ("POS_EQ_RA_MAIN", "POS_EQ_DEC_MAIN"):
-            [field] = [field for field in chosen if field.ucd == ucd]
+            [field] = [field for field in columns if field.ucd == ucd]
             assert (field.datatype, str(field.unit), field.ref) == ("double", "deg", "starcat.icrs")
 
 
 def test_a_radius_of_nothing_gives_the_columns_only(client):
-    found = parse(io.BytesIO(ask(client, SR=0).content)).get_first_table()
-    assert len(found.array) == 0
-    assert [f.name for f in found.fields] == [f.name for f in fields_of(ask(client).content)]
+    table = parse(io.BytesIO(ask(client, SR=0).content)).get_first_table()
+    assert len(table.array) == 0
+    assert [f.name for f in table.fields] == [f.name for f in fields_of(ask(client).content)]
 
 
 @pytest.mark.parametrize(("maxrec", "is_over"), [(0, True), (3, True), (999, False)])
 def test_a_search_is_cut_and_says_so(client, stars, maxrec, is_over):
     answer = ask(client, MAXREC=maxrec)
-    found = parse(io.BytesIO(answer.content)).get_first_table().array
-    assert found["designation"].tolist() == near(stars, 83.6, -5.4, 20.0)[:maxrec]
+    rows = parse(io.BytesIO(answer.content)).get_first_table().array
+    assert rows["designation"].tolist() == near(stars, 83.6, -5.4, 20.0)[:maxrec]
     assert (b'value="OVERFLOW"' in answer.content) == is_over
 
 
@@ -116,10 +116,10 @@ def test_another_format_has_the_same_stars(client, stars):
 
 
 def test_the_document_is_of_the_database(client):
-    found = parse(io.BytesIO(ask(client).content))
-    infos = {info.name: info.value for info in found.resources[0].infos}
+    document = parse(io.BytesIO(ask(client).content))
+    infos = {info.name: info.value for info in document.resources[0].infos}
     assert infos == {"QUERY_STATUS": "OK", "artifact": "small", "version": "1.0.0"}
-    [system] = found.resources[0].coordinate_systems
+    [system] = document.resources[0].coordinate_systems
     assert (system.system, system.epoch) == ("ICRS", "J2026")
 
 
@@ -136,12 +136,12 @@ def address(served: Served) -> str:
 
 
 def test_pyvo_searches_and_gets_the_error(address, stars):
-    found = conesearch(address, pos=(83.6, -5.4), radius=20.0, verbosity=1)
+    rows = conesearch(address, pos=(83.6, -5.4), radius=20.0, verbosity=1)
     expected = near(stars, 83.6, -5.4, 20.0)
-    assert [row.id for row in found] == expected
+    assert [row.id for row in rows] == expected
     first = list(stars["designation"]).index(expected[0])
-    assert found[0].pos.ra.deg == stars["ra_deg"][first]
-    assert found[0].pos.dec.deg == stars["dec_deg"][first]
+    assert rows[0].pos.ra.deg == stars["ra_deg"][first]
+    assert rows[0].pos.dec.deg == stars["dec_deg"][first]
     with pytest.raises(DALQueryError, match="VERB is '7'; give a whole number from 1 to 3"):
         conesearch(address, pos=(0.0, 0.0), radius=1.0, verbosity=7)
 

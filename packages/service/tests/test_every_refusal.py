@@ -68,9 +68,9 @@ def words_of_tap(answer: Response) -> str:
     """Return the words of an error as DALI has it."""
     assert answer.headers["content-type"].startswith("application/x-votable+xml")
     [status] = [
-        one
-        for one in ElementTree.fromstring(answer.content).iter()
-        if one.get("name") == "QUERY_STATUS"
+        element
+        for element in ElementTree.fromstring(answer.content).iter()
+        if element.get("name") == "QUERY_STATUS"
     ]
     assert status.get("value") == "ERROR"
     return status.text or ""
@@ -134,7 +134,7 @@ class TestEveryRefusal:
         before = lasting(shared_root)
         answer = send(client, request_, fields)
         assert str(answer.status_code) == status, answer.text[:300]
-        begins = next(one for one in FORMS if request_.split(" ")[1].startswith(one))
+        begins = next(prefix for prefix in FORMS if request_.split(" ")[1].startswith(prefix))
         assert words in FORMS[begins](answer)
         hidden = ["Traceback", str(shared_root), "root:x:0"]
         if begins == "/":
@@ -159,9 +159,9 @@ def test_the_message_of_a_failed_job_names_no_option(client):
     job = submit_ingest(service, "gaia", "me").job
     attempt = Attempt(service.records, begin_next(service.records, ["ingest"]))
     attempt.log("warning", "a.dat: cut off; go on with resume=True")
-    found, advice = "a.dat already exists and differs", ["choose another {output}"]
-    problem = {"title": "Conflict", "status": 409, "detail": f"{found}; choose another output"}
-    attempt.end(Outcome("failed", problem | {"problem": found, "advice": advice}))
+    text, advice = "a.dat already exists and differs", ["choose another {output}"]
+    problem = {"title": "Conflict", "status": 409, "detail": f"{text}; choose another output"}
+    attempt.end(Outcome("failed", problem | {"problem": text, "advice": advice}))
     for address in (f"/jobs/{job.id}", "/jobs"):
         words = visible(client.get(address).text)
         assert "a.dat already exists and differs" in words

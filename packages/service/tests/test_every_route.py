@@ -95,7 +95,8 @@ class TestEveryRoute:
                 assert answer.status_code < 500, role
 
     @pytest.mark.parametrize(
-        ("method", "path"), [one for one in ROUTES if "{" in one[1] and "digest" not in one[1]]
+        ("method", "path"),
+        [route for route in ROUTES if "{" in route[1] and "digest" not in route[1]],
     )
     def test_nothing_has_an_unknown_name(self, client, users, method, path):
         is_rest = path.startswith("/api/v1/")
@@ -107,7 +108,7 @@ class TestEveryRoute:
             assert "Traceback" not in answer.text
             assert str(client.app.state.service.paths.root) not in answer.text
 
-    @pytest.mark.parametrize(("method", "path"), [one for one in ROUTES if one[0] != "GET"])
+    @pytest.mark.parametrize(("method", "path"), [route for route in ROUTES if route[0] != "GET"])
     def test_other_sites_change_nothing(self, client, users, method, path):
         for site in ({"Sec-Fetch-Site": "cross-site"}, {"Origin": "https://evil.example"}):
             answer = client.request(

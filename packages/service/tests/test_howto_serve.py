@@ -29,9 +29,9 @@ def test_the_table_of_settings_is_that_of_the_program() -> None:
 def test_the_table_of_figures_is_that_of_the_program(tmp_path: Path) -> None:
     page = PAGE.read_text()
     service = Service(read_settings(tmp_path))
-    for one in Metrics(service).registry.collect():
-        name = f"{one.name}_total" if one.type == "counter" else one.name
-        assert f"| `{name}` | {one.documentation} |" in page
+    for figure in Metrics(service).registry.collect():
+        name = f"{figure.name}_total" if figure.type == "counter" else figure.name
+        assert f"| `{name}` | {figure.documentation} |" in page
     service.close()
 
 

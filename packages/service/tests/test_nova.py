@@ -28,17 +28,19 @@ from starcat_service.api.nova import calibration_of
 from starcat_service.candidates import try_each
 
 
-def sent(client, address, given, **files):
+def sent(client, address, arguments, **files):
     """Send what nova's clients send: JSON in a field of a form."""
-    return client.post(address, data={"request-json": json.dumps(given)}, files=files or None)
+    return client.post(address, data={"request-json": json.dumps(arguments)}, files=files or None)
 
 
 @pytest.fixture(scope="module")
 def frame(small_database):
     """A frame with many stars of the small database."""
-    known = open_database(small_database)
-    frames = simulate_frames(known.directions, known.camera, 10, Noise(noise_px=0.05), 5, known.mag)
-    return max(frames, key=lambda one: len(one.mag))
+    database = open_database(small_database)
+    frames = simulate_frames(
+        database.directions, database.camera, 10, Noise(noise_px=0.05), 5, database.mag
+    )
+    return max(frames, key=lambda frame: len(frame.mag))
 
 
 def test_a_picture_is_solved(client, frame, small_database):
@@ -51,15 +53,15 @@ def test_a_picture_is_solved(client, frame, small_database):
     number = answer["subid"]
     assert client.get(f"/api/submissions/{number}").json()["jobs"] == [number]
     assert client.get(f"/api/jobs/{number}").json() == {"status": "success"}
-    found = client.get(f"/api/jobs/{number}/calibration/").json()
+    calibration = client.get(f"/api/jobs/{number}/calibration/").json()
     ra_deg, dec_deg, _ = radec_roll_from_matrix(frame.matrix)
     truth = SkyCoord(ra_deg, dec_deg, unit="deg")
-    assert truth.separation(SkyCoord(found["ra"], found["dec"], unit="deg")).arcsec < 60
-    assert found["width_arcsec"] / 3600 == pytest.approx(
+    assert truth.separation(SkyCoord(calibration["ra"], calibration["dec"], unit="deg")).arcsec < 60
+    assert calibration["width_arcsec"] / 3600 == pytest.approx(
         np.degrees(camera.width_px / camera.focal_length_px), rel=0.01
     )
     info = client.get(f"/api/jobs/{number}/info/").json()
-    assert info["calibration"] == found
+    assert info["calibration"] == calibration
     assert len(info["objects_in_field"]) >= 4
     objects = client.get(f"/api/jobs/{number}/objects_in_field/").json()
     assert objects["objects_in_field"] == info["objects_in_field"]
@@ -77,10 +79,13 @@ def test_centroids_are_solved_whichever_way_y_counts(client, frame, small_databa
     size = {"image_width": camera.width_px, "image_height": camera.height_px}
     for rows in (y, camera.height_px + 1 - y):
         answer = sent(client, "/api/upload", {"x": x.tolist(), "y": rows.tolist(), **size}).json()
-        found = client.get(f"/api/jobs/{answer['subid']}/calibration").json()
+        calibration = client.get(f"/api/jobs/{answer['subid']}/calibration").json()
         ra_deg, dec_deg, _ = radec_roll_from_matrix(frame.matrix)
         truth = SkyCoord(ra_deg, dec_deg, unit="deg")
-        assert truth.separation(SkyCoord(found["ra"], found["dec"], unit="deg")).arcsec < 60
+        assert (
+            truth.separation(SkyCoord(calibration["ra"], calibration["dec"], unit="deg")).arcsec
+            < 60
+        )
 
 
 @pytest.mark.parametrize("turn_deg", [-170.0, -30.0, 0.0, 75.0])
@@ -95,13 +100,13 @@ def test_a_calibration_says_where_up_is(turn_deg, parity):
     wcs.wcs.cd = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) @ flip
     header = wcs.to_header()
     header["IMAGEW"], header["IMAGEH"] = 1000, 800
-    found = calibration_of(header.tostring())
-    assert (found["ra"], found["dec"]) == pytest.approx((40.0, 20.0))
-    assert found["pixscale"] == pytest.approx(36.0)
-    assert found["parity"] == parity
+    calibration = calibration_of(header.tostring())
+    assert (calibration["ra"], calibration["dec"]) == pytest.approx((40.0, 20.0))
+    assert calibration["pixscale"] == pytest.approx(36.0)
+    assert calibration["parity"] == parity
     centre, above = wcs.pixel_to_world(499.5, 399.5), wcs.pixel_to_world(499.5, 400.5)
     up_deg = centre.position_angle(above).deg
-    assert (found["orientation"] - up_deg + 180) % 360 - 180 == pytest.approx(0.0, abs=0.05)
+    assert (calibration["orientation"] - up_deg + 180) % 360 - 180 == pytest.approx(0.0, abs=0.05)
 
 
 def without_stars():
@@ -134,10 +139,10 @@ def test_a_session_alone_lets_an_upload_in_and_bad_json_gets_none(tmp_path):
         answer = sent(client, "/api/upload", {"session": login["session"]}, file=picture).json()
         assert "session" not in answer["errormessage"]
         assert sent(client, "/api/login", {"apikey": "wrong"}).status_code == 401
-        for given in ({}, {"session": "wrong"}):
-            assert sent(client, "/api/upload", given, file=picture).status_code == 401
-        for given in ("{", "[]", "[" * 200_000):
-            answer = client.post("/api/login", data={"request-json": given}).json()
+        for arguments in ({}, {"session": "wrong"}):
+            assert sent(client, "/api/upload", arguments, file=picture).status_code == 401
+        for text in ("{", "[]", "[" * 200_000):
+            answer = client.post("/api/login", data={"request-json": text}).json()
             assert answer["status"] == "error"
             assert "request-json" in answer["errormessage"]
 
@@ -191,14 +196,14 @@ def test_the_field_that_an_attempt_has_found_chooses_the_next_database(wide_titl
     tried: list[tuple[str, object]] = []
 
     def in_order(fields_deg):
-        right = [one for one in wide_titles if one.id == "9" and fields_deg]
-        return [*right, *(one for one in wide_titles if one not in right)]
+        right = [database for database in wide_titles if database.id == "9" and fields_deg]
+        return [*right, *(database for database in wide_titles if database not in right)]
 
     def identify(database, fields_deg):
         tried.append((database.id, fields_deg and round(sum(fields_deg) / 2, 6)))
-        found = {"status": "identified"} if database.id == "9" else {"status": "no_match"}
+        frame = {"status": "identified"} if database.id == "9" else {"status": "no_match"}
         refusal = {"message": "the frame fits a field of 20 deg"}
-        return found if database.id == "9" else {**found, "refusal": refusal, "fits_fov_deg": 20.0}
+        return frame if database.id == "9" else {**frame, "refusal": refusal, "fits_fov_deg": 20.0}
 
     attempts = try_each(in_order, None, identify, lambda answer: answer)
     assert tried == [("0", None), ("9", 20.0)]
@@ -238,11 +243,11 @@ def test_the_page_chooses_a_database_too(both, frame, small_database):
 @pytest.mark.slow
 def test_the_size_of_a_picture_is_taken_from_the_file(both, small_database):
     """A picture of another size than the database's camera, of which only the field is stated."""
-    known = open_database(small_database)
-    own = known.camera
-    other = Camera(own.width_px, own.height_px * 3 // 4, own.focal_length_px)
-    frames = simulate_frames(known.directions, other, 10, Noise(noise_px=0.05), 5, known.mag)
-    content = picture_of(max(frames, key=lambda one: len(one.mag)), other)
+    database = open_database(small_database)
+    camera = database.camera
+    other = Camera(camera.width_px, camera.height_px * 3 // 4, camera.focal_length_px)
+    frames = simulate_frames(database.directions, other, 10, Noise(noise_px=0.05), 5, database.mag)
+    content = picture_of(max(frames, key=lambda frame: len(frame.mag)), other)
     form = {"database": DATABASE, "camera.flip": "on"}
     form["camera.fov_x_deg"] = f"{other.fov_x_deg}"
     with client_of(both, anonymous="reader") as client:
@@ -268,9 +273,9 @@ def test_astroquery_solves_photographs(tmp_path, nights):
         client = AstrometryNet()
         client.URL, client.API_URL, client.api_key = served.address, f"{served.address}/api", "any"
         for path in sorted((nights / "spel").iterdir())[:20]:
-            found = client.solve_from_image(path, verbose=False)
-            wcs = WCS(found, naxis=2)
-            width = found["IMAGEW"]
-            left, other = wcs.pixel_to_world([0, width - 1], [0, 0])
-            right += 40 < left.separation(other).deg < 60
+            header = client.solve_from_image(path, verbose=False)
+            wcs = WCS(header, naxis=2)
+            width = header["IMAGEW"]
+            west, other = wcs.pixel_to_world([0, width - 1], [0, 0])
+            right += 40 < west.separation(other).deg < 60
     assert right == 20

@@ -104,8 +104,8 @@ def test_every_page_is_whole_and_has_no_script_or_style_of_its_own(pages):
         page = Page(text)
         tags = [tag for tag, _ in page.tags]
         assert text.startswith("<!doctype html>"), address
-        for one in ("h1", "main", "header", "footer"):
-            assert tags.count(one) == 1, (address, one)
+        for tag in ("h1", "main", "header", "footer"):
+            assert tags.count(tag) == 1, (address, tag)
         assert '<a class="skip" href="#content">' in text
         assert 'lang="en"' in text
         assert 'href="/docs"' in text
@@ -120,20 +120,20 @@ def test_every_page_is_whole_and_has_no_script_or_style_of_its_own(pages):
 def test_a_page_has_no_address_elsewhere_and_its_links_lead_somewhere(pages, client):
     others = ("/databases", "/identify", "/releases", "/sign-out", "/")
     posted = ("/cancel", "/retry", "/preview", "/tiling")
-    known = {}
+    statuses = {}
     for address, text in pages.items():
-        for found in Page(text).addresses():
-            if found.startswith("data:application/x-ipynb+json"):
+        for link in Page(text).addresses():
+            if link.startswith("data:application/x-ipynb+json"):
                 continue  # a file that the page contains
-            assert found.startswith(("/", "#", "?")), (address, found)
-            assert not found.startswith("//"), (address, found)
-            path = urljoin(address, found).partition("#")[0]
+            assert link.startswith(("/", "#", "?")), (address, link)
+            assert not link.startswith("//"), (address, link)
+            path = urljoin(address, link).partition("#")[0]
             is_ours = path not in others and not path.startswith(("/databases/", "/api/v1/"))
-            is_new = path not in known and found[0] != "#"
+            is_new = path not in statuses and link[0] != "#"
             if is_ours and is_new and not path.endswith(posted):
-                known[path] = client.get(path).status_code
-    assert {path: status for path, status in known.items() if status != 200} == {}
-    assert len(known) > 8
+                statuses[path] = client.get(path).status_code
+    assert {path: status for path, status in statuses.items() if status != 200} == {}
+    assert len(statuses) > 8
 
 
 def test_what_others_have_written_is_text(pages, job):
@@ -149,8 +149,8 @@ def test_static_files_stay_and_nothing_else_is_given(client):
         assert answer.status_code == 200
         assert answer.content == content
         assert "immutable" in answer.headers["cache-control"]
-        found = re.findall(rb"https?://[^\s\"')]+", content)
-        assert [one for one in found if one != b"http://www.w3.org/2000/svg"] == [], name
+        urls = re.findall(rb"https?://[^\s\"')]+", content)
+        assert [url for url in urls if url != b"http://www.w3.org/2000/svg"] == [], name
     for path in (f"/static/{DIGEST}/nothing.css", "/static/0/starcat.css"):
         assert client.get(path).status_code == 404
     for path in ("..%2f__init__.py", "%2e%2e/rendering.py", "..\\rendering.py"):
@@ -213,7 +213,7 @@ def test_a_camera_changes_between_its_field_and_its_lens():
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "told"),
+    ("key", "value", "words"),
     [
         ("selection.faint_limit_mag", "", "missing"),
         ("selection.faint_limit_mag", "bright", "found 'bright'"),
@@ -221,11 +221,11 @@ def test_a_camera_changes_between_its_field_and_its_lens():
     ],
 )
 def test_an_error_is_reported_next_to_its_field_in_the_words_of_the_command(
-    key, value, told, tmp_path
+    key, value, words, tmp_path
 ):
     draft = draft_of_form(_form(SPEC, **{key: value}))
     assert list(draft.errors) == [key]
-    assert told in draft.errors[key]
+    assert words in draft.errors[key]
     assert draft.values[key] == value
     (tmp_path / "spec").write_text(draft.text, encoding="utf-8")
     with pytest.raises(ConfigError) as raised:
@@ -256,8 +256,8 @@ def test_a_text_that_is_not_a_spec_is_reported_and_nothing_is_lost(text):
     ],
 )
 def test_a_form_changes_its_keys_and_keeps_comments(text):
-    known = draft_of_text(text)
-    assert known.spec is not None
+    parsed = draft_of_text(text)
+    assert parsed.spec is not None
     changes = {"selection.faint_limit_mag": "4", "selection.max_stars_per_field": "20"}
     draft = draft_of_form(_form(text, **changes))
     assert draft.error is None
@@ -331,9 +331,9 @@ def test_a_catalog_that_is_not_here_is_reported(client, monkeypatch):
     text = SPEC.replace('"gaia"', '"sao"')
     page = client.post("/new", data={"toml": text, "toml-before": "", "do": "preview"})
     assert page.status_code == 422
-    [told] = re.findall(r'id="catalog.source-error">([^<]*)<', page.text)
-    assert "no file found" in told
-    assert "Ask the operator of this service" in told
+    [message] = re.findall(r'id="catalog.source-error">([^<]*)<', page.text)
+    assert "no file found" in message
+    assert "Ask the operator of this service" in message
     assert "--input" not in page.text
 
 
@@ -436,4 +436,6 @@ def test_tables_and_formulas_of_the_documentation_are_tables_and_formulas():
         assert "|---" not in pages[name]
     bodies = [re.sub(r"(?s)<(pre|code).*?</\1>", "", body) for body in pages.values()]
     assert sum(body.count("<math ") for body in bodies) > 100
-    assert not [found for body in bodies for found in re.findall(r"\$.*|\\(?:frac|sigma).*", body)]
+    assert not [
+        formula for body in bodies for formula in re.findall(r"\$.*|\\(?:frac|sigma).*", body)
+    ]

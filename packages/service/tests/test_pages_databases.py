@@ -78,9 +78,9 @@ def test_every_reason_leads_to_its_records(client, small_database):
     [table] = re.findall(r'<table id="rejections-table".*?</table>', page, re.DOTALL)
     rejected = manifest["sources"][0]["rejected"]
     assert rejected
-    found = re.findall(r'href="([^"]*)" aria-label="(\d+) records: ([^"]*)"', table)
-    assert {name.replace(" ", "_"): int(count) for _, count, name in found} == rejected
-    for address, count, name in found:
+    links = re.findall(r'href="([^"]*)" aria-label="(\d+) records: ([^"]*)"', table)
+    assert {name.replace(" ", "_"): int(count) for _, count, name in links} == rejected
+    for address, count, name in links:
         answer = text_of(client.get(f"{address}&rows=2000").text)
         assert f"{count} rows" in answer, name
 
@@ -90,8 +90,10 @@ def test_the_attitude_error_of_the_fields_is_on_the_coverage_page(client, small_
     errors = report["coverage"]["attitude_error_arcsec_per_px"]
     text = client.get(f"{PAGE}/coverage").text
     for axis in ("across", "about"):
-        told = " ".join(f"{errors[axis][name]:.3g}" for name in ("median", "one_percent", "worst"))
-        assert f"{axis} the boresight {told}" in text_of(text.replace("><", "> <"))
+        figures = " ".join(
+            f"{errors[axis][name]:.3g}" for name in ("median", "one_percent", "worst")
+        )
+        assert f"{axis} the boresight {figures}" in text_of(text.replace("><", "> <"))
     [picture] = re.findall(r'<img src="([^"]*attitude_error.png)"', text)
     assert client.get(picture).headers["content-type"] == "image/png"
 
@@ -159,8 +161,8 @@ def test_the_map_has_the_colour_of_each_field_at_its_boresight(client, small_dat
     assert inside.mean() > 0.95  # some lie in the last pixel of the edge
     for number in np.flatnonzero(inside):
         stars = content["stars"][number]
-        [one] = [b for b in bins if b.least <= stars and (b.most is None or stars <= b.most)]
-        expected = bytes.fromhex(one.colour)
+        [colour_bin] = [b for b in bins if b.least <= stars and (b.most is None or stars <= b.most)]
+        expected = bytes.fromhex(colour_bin.colour)
         assert bytes(pixels[row[number], column[number], :3].tolist()) == expected
 
 
@@ -168,7 +170,7 @@ def test_the_map_has_the_colour_of_each_field_at_its_boresight(client, small_dat
 @given(st.lists(st.integers(0, 200), min_size=1, max_size=60))
 def test_every_number_of_stars_has_one_colour(stars):
     bins = coverage_map.colour_bins(np.array(stars))
-    assert len({one.name for one in bins}) == len(bins) <= 10
+    assert len({colour_bin.name for colour_bin in bins}) == len(bins) <= 10
     for count in range(min(stars), max(stars) + 1):
         fitting = [b for b in bins if b.least <= count and (b.most is None or count <= b.most)]
         assert len(fitting) == 1
@@ -182,9 +184,9 @@ def test_the_report_of_a_build_can_do_nothing_but_lead_back(client, small_databa
     assert f'href="{PAGE}"' in head
     assert 'href="/identify"' in head
     assert end
-    own = (small_database / "report" / "index.html").read_text("utf-8")
+    written = (small_database / "report" / "index.html").read_text("utf-8")
     shown = before + body + report
-    assert re.sub("[,\N{NARROW NO-BREAK SPACE}]", "", shown) == own.replace(",", "")
+    assert re.sub("[,\N{NARROW NO-BREAK SPACE}]", "", shown) == written.replace(",", "")
     assert re.search(r">\d{1,3}(,\d{3})+<", shown) is None
     assert answer.headers["content-security-policy"] == (
         "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox allow-same-origin"
@@ -260,8 +262,8 @@ def test_named_queries_are_answered_with_values_of_their_types(client):
     assert "0 rows" in text_of(asked(client, named_query("changed-stars").text, **changed).text)
     alone = asked(client, named_query("changed-stars").text, named="changed-stars")
     assert "is about 2 targets" in text_of(alone.text)
-    own = asked(client, "SELECT $a + 1 AS b", **{"value.a": "2"})
-    assert "1 row" in text_of(own.text)
+    unnamed = asked(client, "SELECT $a + 1 AS b", **{"value.a": "2"})
+    assert "1 row" in text_of(unnamed.text)
 
 
 def test_an_answer_comes_as_a_file(client):

@@ -45,7 +45,7 @@ def simulated(small_database: Path):
 
 def quaternion_in(page: str) -> np.ndarray:
     [text] = re.findall(r"<code>\[([-0-9., e]+)\]</code>", page)
-    return np.array([float(one) for one in text.split(",")])
+    return np.array([float(component) for component in text.split(",")])
 
 
 def asked(client: TestClient, files: dict | None = None, **fields: str | int):
@@ -66,8 +66,8 @@ def test_a_simulated_frame_is_drawn_measured_and_identified(client, simulated):
     assert error_rad(answer.text, simulated.matrix) < 2e-3
     [picture] = re.findall(r'<img src="data:image/svg[+]xml;base64,([^"]+)"', answer.text)
     drawn = ElementTree.fromstring(base64.b64decode(picture))
-    left, top, *size = map(float, drawn.get("viewBox").split())
-    assert min(left, top) > 40  # without the margins
+    x, top, *size = map(float, drawn.get("viewBox").split())
+    assert min(x, top) > 40  # without the margins
     assert size == pytest.approx([float(drawn.get(name)[:-2]) for name in ("width", "height")])
     assert max(size) == pytest.approx(9 * 72)
     assert "SAO" in answer.text
@@ -89,7 +89,7 @@ def pasted(frame, *, is_up: bool = False, scale: float = 1.0, height: float = 51
     """The centroids of a frame, with magnitudes, as a user pastes them."""
     x, y = (frame.centroids_px * scale).T
     rows = zip(x, height * scale - y if is_up else y, frame.mag, strict=True)
-    return "\n".join(f"{one:.4f} {two:.4f} {mag:.3f}" for one, two, mag in rows)
+    return "\n".join(f"{x_px:.4f} {y_px:.4f} {mag:.3f}" for x_px, y_px, mag in rows)
 
 
 def test_a_frame_of_another_camera_is_identified(client, simulated):
@@ -148,8 +148,8 @@ def test_a_time_gives_the_attitude_without_aberration(client, simulated):
 
 def files_of(page: str) -> dict[str, bytes]:
     """The files that an answer offers, by the end of their names."""
-    found = re.findall(r'href="data:([^"]*);base64,([^"]*)" download="[^"]*-?answer\.?(\w*)"', page)
-    files = {kind: base64.b64decode(content) for _, content, kind in found}
+    links = re.findall(r'href="data:([^"]*);base64,([^"]*)" download="[^"]*-?answer\.?(\w*)"', page)
+    files = {kind: base64.b64decode(content) for _, content, kind in links}
     [wcs] = re.findall(r'href="data:application/fits;base64,([^"]*)"', page)
     return {**files, "fits": base64.b64decode(wcs)}
 
@@ -162,16 +162,16 @@ def test_an_answer_is_saved_as_json_csv_and_wcs(client, simulated):
     rows = list(csv.DictReader(files["csv"].decode().splitlines()))
     assert len(rows) == len(frame["stars"])
     assert {row["star"] for row in rows if row["star"]} == {
-        one["star"] for one in frame["stars"] if one["star"]
+        star["star"] for star in frame["stars"] if star["star"]
     }
     with fits.open(io.BytesIO(files["fits"])) as parts:
         header, data = parts[0].header, parts[0].data
     assert data.size == 0
-    matched = [one for one in frame["stars"] if one["star"]]
-    pixels = np.array([[one["x_px"], one["y_px"]] for one in matched]) - 0.5
+    matched = [star for star in frame["stars"] if star["star"]]
+    pixels = np.array([[star["x_px"], star["y_px"]] for star in matched]) - 0.5
     sky = WCS(header).pixel_to_world(*pixels.T)
-    off = sky.separation(SkyCoord([one["ra_deg"] for one in matched],
-                                  [one["dec_deg"] for one in matched], unit="deg"))  # fmt: skip
+    off = sky.separation(SkyCoord([star["ra_deg"] for star in matched],
+                                  [star["dec_deg"] for star in matched], unit="deg"))  # fmt: skip
     assert off.arcsec.max() < 1.5 * 512  # a centroid is off by a pixel or so, of 281 arcsec
     assert (header["IMAGEW"], header["IMAGEH"]) == (512, 512)
 
@@ -222,10 +222,10 @@ def test_the_table_has_the_names_of_the_picture():
         ]
         + [{"x_px": 3.0, "y_px": 4.0, "star": None, "mag": None}],
     }
-    found = {"frames": [content], "more": [{"mag": None, "wcs": None}],
+    answer = {"frames": [content], "more": [{"mag": None, "wcs": None}],
              "notes": [], "method": "triangle"}  # fmt: skip
-    [frame] = shown_frames(found, {"database": DATABASE}, 2016.0)
-    assert [one["name"] for one in frame.stars] == ["Procyon", "Gaia …23456789"]
+    [frame] = shown_frames(answer, {"database": DATABASE}, 2016.0)
+    assert [star["name"] for star in frame.stars] == ["Procyon", "Gaia …23456789"]
 
 
 def test_a_refusal_has_the_words_of_the_matcher(client):
@@ -244,10 +244,10 @@ def test_what_was_sent_stays_in_the_form_and_large_files_are_refused(client):
 
 
 def test_a_seed_is_the_same_frame_and_no_other(client):
-    one, same, other = (
+    first, same, other = (
         client.get(f"/identify/frame/{DATABASE}?seed={seed}").content for seed in (1, 1, 2)
     )
-    assert one == same != other
+    assert first == same != other
     assert client.get(f"/identify/frame/{DATABASE}?seed=-1").status_code == 422
     assert client.get(f"/identify/frame/{'0' * 16}").status_code == 404
 
@@ -309,14 +309,14 @@ def test_attitudes_are_planned_as_in_python(client, small_database, tmp_path):
     answer = client.post("/plan", data={"database": DATABASE, "attitudes": TABLE, **angles})
     assert answer.status_code == 200, answer.text
     [packed] = re.findall(r'href="data:application/json;base64,([^"]+)"', answer.text)
-    found = json.loads(base64.b64decode(packed))
+    plan = json.loads(base64.b64decode(packed))
     (tmp_path / "table.csv").write_text(TABLE)
     expected = starcat.plan(
         small_database, tmp_path / "table.csv", keep_out_deg={"Sun": 179.0}, noise_px=0.5
     )
-    assert found["summary"] == expected.summary
-    assert found["attitudes"] == [expected.attitude(row) for row in range(2)]
-    assert found["first_stars"] == expected.stars_of(0)
+    assert plan["summary"] == expected.summary
+    assert plan["attitudes"] == [expected.attitude(row) for row in range(2)]
+    assert plan["first_stars"] == expected.stars_of(0)
     assert "0 of 2 attitudes usable" in answer.text
     assert "2027-03-01T06:31:00Z" in answer.text
     [plot] = re.findall(r'<img src="data:image/svg[+]xml;base64,([^"]+)"', answer.text)

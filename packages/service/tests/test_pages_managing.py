@@ -57,7 +57,7 @@ def test_an_evaluation_is_on_the_page_of_its_database_and_stays_with_it(client, 
     # One axis for all curves, from below the lowest end of an interval.
     assert re.findall(r'class="tick" x="-6"[^>]*>([\d.]+)<', page) == ["80", "90", "100"]
     listed = client.get("/api/v1/jobs", params={"database": DATABASE}).json()
-    assert [one["id"] for one in listed["jobs"]] == [job["id"]]
+    assert [listed_job["id"] for listed_job in listed["jobs"]] == [job["id"]]
     assert client.get("/api/v1/jobs", params={"database": "0" * 16}).json()["total"] == 0
     service = client.app.state.service
     other = waiting_build(service, "a" * 16)
@@ -150,8 +150,8 @@ def test_two_databases_are_compared_by_rates_and_maps(
     assert re.search(rf"self-test: clean</th><td[^>]*>{shown} .*{shown} ", page)
     assert re.search(rf"evaluation: clean</th><td[^>]*>{shown} .*–</td></tr>", page)
     pictures = re.findall(r'<image href="([^"]+)"', page)
-    assert [one.split("/")[2] for one in pictures] == [DATABASE, OTHER]
-    maps = [client.get(one).content for one in pictures]
+    assert [picture.split("/")[2] for picture in pictures] == [DATABASE, OTHER]
+    maps = [client.get(picture).content for picture in pictures]
     assert maps[0] == maps[1]  # of the same stars in the same colours
     assert len(maps[0]) > 1000
 
@@ -167,11 +167,11 @@ def test_tokens_are_created_shown_once_and_revoked(own_root, monkeypatch):
         # Tokens are managed with a token only, even if everybody may publish.
         assert client.post("/api/v1/tokens", json={"name": "me"}).status_code == 401
         assert client.get("/tokens").url.path == "/sign-in"
-        made = client.post("/tokens", data=form, headers=headers).text
-        [token] = re.findall(r'id="new-token"[^>]*>(starcat_[\w-]{43})<', made)
+        page = client.post("/tokens", data=form, headers=headers).text
+        [token] = re.findall(r'id="new-token"[^>]*>(starcat_[\w-]{43})<', page)
         assert token not in client.get("/tokens", headers=headers).text
-        own = {"Authorization": f"Bearer {token}"}
-        assert client.get("/jobs", headers=own).status_code == 200
+        anna_headers = {"Authorization": f"Bearer {token}"}
+        assert client.get("/jobs", headers=anna_headers).status_code == 200
         wrong = {
             ("name", "anna"): "there is a valid token with the name &#39;anna&#39;",
             ("role", "operator"): "reader",
@@ -183,15 +183,15 @@ def test_tokens_are_created_shown_once_and_revoked(own_root, monkeypatch):
             assert again.status_code == 422, field
             assert words in again.text
         listed = client.get("/api/v1/tokens", headers=headers).json()["tokens"]
-        assert [(one["name"], one["role"], one["state"]) for one in listed] == [
+        assert [(entry["name"], entry["role"], entry["state"]) for entry in listed] == [
             ("operator", "publisher", "valid"),
             ("anna", "builder", "valid"),
         ]
-        operator, anna = (one["id"] for one in listed)
+        operator, anna = (entry["id"] for entry in listed)
         assert client.post(f"/tokens/{operator}/revoke", headers=headers).status_code == 409
         assert client.post(f"/tokens/{anna}/revoke", headers=headers).status_code == 200
         assert client.delete(f"/api/v1/tokens/{anna}", headers=headers).status_code == 404
-        assert client.get("/jobs", headers=own).status_code == 401
+        assert client.get("/jobs", headers=anna_headers).status_code == 401
 
 
 # Catalogs
@@ -211,7 +211,7 @@ def test_a_catalog_is_read_and_its_table_removed(client, own_root):
         assert client.post(f"/catalogs/{name}/remove").status_code in (400, 404), name
         assert client.delete(f"/api/v1/catalogs/stored/{name}").status_code in (400, 404), name
     assert client.post(f"/catalogs/{TABLE}/remove").url.path == "/catalogs"
-    assert [one.name for one in (own_root / "catalogs").iterdir()] == ["not-of-a-job"]
+    assert [path.name for path in (own_root / "catalogs").iterdir()] == ["not-of-a-job"]
 
 
 # Searching
@@ -227,15 +227,15 @@ def test_jobs_are_searched_by_words_and_by_what_they_are(client):
         assert client.get("/api/v1/jobs", params={"text": text}).json()["total"] == count
     assert 'value="&#34;&gt;&lt;b&gt;"' in client.get("/jobs", params={"q": '"><b>'}).text
     kinds = ({"kind": "build"}, {"state": "queued"}, {"owner": "nobody"}, {"offset": 1, "limit": 5})
-    listed = [client.get("/api/v1/jobs", params=wanted).json()["jobs"] for wanted in kinds]
+    listed = [client.get("/api/v1/jobs", params=conditions).json()["jobs"] for conditions in kinds]
     assert [len(jobs) for jobs in listed] == [1, 2, 0, 1]
 
 
 def test_releases_are_searched_and_ordered(client, own_root, database_version):
     add_database(own_root, database_version("1.1.0"), OTHER)
     for database, note in ((DATABASE, "For June"), (OTHER, "For May")):
-        wanted = {"database": database, "note": note}
-        assert client.post("/api/v1/releases", json=wanted).status_code == 201
+        publication = {"database": database, "note": note}
+        assert client.post("/api/v1/releases", json=publication).status_code == 201
 
     def titles(**query: str) -> list[str]:
         page = client.get("/releases", params=query).text

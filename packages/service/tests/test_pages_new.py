@@ -133,8 +133,8 @@ def test_the_description_follows_the_design_until_its_user_writes_one():
     assert again.spec.description == words.replace("17", "12.5")
     assert "description" not in design_query(again, "gaia-12deg")
     assert pinned_draft(design_query(again, "gaia-12deg")).content == again.content
-    own = _changed(again.text, description="For Anna's camera")
-    assert _changed(own.text, camera__fov_x_deg="20").spec.description == "For Anna's camera"
+    described = _changed(again.text, description="For Anna's camera")
+    assert _changed(described.text, camera__fov_x_deg="20").spec.description == "For Anna's camera"
     typed = draft_of_form({"toml": first.text.replace("= 12.0", "= 19.0"), "toml-before": ""})
     assert typed.spec.description.startswith("Guide stars for a field of 19 x 19 deg")
     renamed = _changed(first.text, name="mine", version="2.0.0")
@@ -154,8 +154,8 @@ def test_who_may_only_read_builds_nothing(tmp_path):
 
 
 def _changed(text: str, **changes: str) -> SpecForm:
-    known = draft_of_text(text)
-    form = {**known.values, "toml": known.text, "toml-before": known.text}
+    draft = draft_of_text(text)
+    form = {**draft.values, "toml": draft.text, "toml-before": draft.text}
     return draft_of_form(form | {key.replace("__", "."): value for key, value in changes.items()})
 
 
@@ -172,8 +172,8 @@ def test_the_years_of_a_mission_and_the_rules_of_the_sensor_are_fields():
     assert draft.errors == {}
     assert draft.spec.epoch_jyear == (2027.0, 2042.0)
     assert draft.values["epoch_jyear"] == "2027-2042"
-    own = draft.spec.selection
-    assert (own.max_drift_arcsec, own.thinning, own.neighbours.action) == (
+    selection = draft.spec.selection
+    assert (selection.max_drift_arcsec, selection.thinning, selection.neighbours.action) == (
         2.0, "information", "merge",
     )  # fmt: skip
     assert _changed(draft.text).text == draft.text
@@ -197,7 +197,7 @@ def test_a_response_is_picked_and_another_takes_the_table_of_the_first_away():
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "words"),
     [
         (b"wavelength_nm,value\n4000,1\n4500,1\n25000,1\n", "angstroms: divide them by 10"),
         (b"a,b,c\n1,2,3\n", "line 1: found 'a,b,c'"),
@@ -206,11 +206,11 @@ def test_a_response_is_picked_and_another_takes_the_table_of_the_first_away():
     ],
     ids=["angstroms", "three columns", "a picture", "too large"],
 )
-def test_a_file_that_is_not_a_response_is_reported_next_to_its_field(client, content, told):
+def test_a_file_that_is_not_a_response_is_reported_next_to_its_field(client, content, words):
     sent = {"toml": SPEC.replace("20.0", "500.0"), "toml-before": "", "response_per": "photon"}
     file = {"response_file": ("sensor.csv", content, "text/csv")}
     state = client.post("/new/preview", data=sent, files=file).json()
-    assert told in state["errors"]["response_file"]
+    assert words in state["errors"]["response_file"]
     assert "sensor.csv" in state["errors"]["response_file"]
     assert not state["can_build"]
     assert "camera.response" not in state["toml"]
@@ -227,9 +227,9 @@ def test_a_second_database_of_one_name_and_version_is_refused(client):
     other = SPEC.replace("4.5", "4.4")
     page = _sent(client, "/new", other, do="build")
     assert page.status_code == 422
-    [told] = re.findall(r'id="version-error">([^<]*)<', page.text)
-    assert "mine 1.0.0 is there already" in told
-    assert "such as 1.0.1" in told
+    [message] = re.findall(r'id="version-error">([^<]*)<', page.text)
+    assert "mine 1.0.0 is there already" in message
+    assert "such as 1.0.1" in message
     wish = {"kind": "build", "spec": other}
     answer = client.post("/api/v1/jobs", json=wish)
     assert (answer.status_code, answer.json()["key"]) == (409, "version")
@@ -361,11 +361,11 @@ def test_an_estimate_has_a_verdict_in_words(client, limit, level, words):
     text = SPEC.replace("4.5", limit).replace("mine", "judged")
     text = text.replace('source = "gaia"', 'source = "gaia"\nband = "G"')
     state = _sent(client, "/new/preview", text).json()
-    told = re.search(r'<p class="verdict (\w+)" id="verdict">([^<]*)<', state["result"])
-    assert told is not None
-    assert told[1] == level
-    assert re.search(words, told[2]), told[2]
-    assert state["can_build"] == ("has to identify" not in told[2]), state["summary"]
+    verdict = re.search(r'<p class="verdict (\w+)" id="verdict">([^<]*)<', state["result"])
+    assert verdict is not None
+    assert verdict[1] == level
+    assert re.search(words, verdict[2]), verdict[2]
+    assert state["can_build"] == ("has to identify" not in verdict[2]), state["summary"]
 
 
 def test_where_a_faint_limit_does_not_help_the_verdict_says_so(client):
@@ -380,18 +380,20 @@ def test_presets_of_catalogs_that_are_not_here_are_in_one_closed_line(client, mo
     text = client.get("/new").text
     assert 'href="/new?preset=gaia-12deg"' in text
     assert 'href="/new?preset=sao-12deg"' not in text
-    told = re.search(r"<details>\s*<summary>(\d) more need catalogs.*?</details>", text, re.DOTALL)
-    assert told is not None
-    assert told[0].count("<li>") == int(told[1])
+    details = re.search(
+        r"<details>\s*<summary>(\d) more need catalogs.*?</details>", text, re.DOTALL
+    )
+    assert details is not None
+    assert details[0].count("<li>") == int(details[1])
     assert (
         "sao-12deg: its operator gets the files with "
-        "<code>starcat fetch sao</code> and <code>starcat fetch hipparcos</code>" in told[0]
+        "<code>starcat fetch sao</code> and <code>starcat fetch hipparcos</code>" in details[0]
     )
 
 
 def test_a_box_makes_a_database_of_many_fields(client):
-    own = {f"products.{name}.enabled": "on" for name in USUAL_PRODUCTS} | {"products": "shown"}
-    box = own | {"products.levels.enabled": "on"}
+    usual = {f"products.{name}.enabled": "on" for name in USUAL_PRODUCTS} | {"products": "shown"}
+    box = usual | {"products.levels.enabled": "on"}
     state = _sent(client, "/new/preview", SPEC, **box, **{"toml-before": SPEC}).json()
     assert tomllib.loads(state["toml"])["products"] == {"levels": {"enabled": True}}
     assert state["products"]["levels"]
@@ -400,7 +402,7 @@ def test_a_box_makes_a_database_of_many_fields(client):
     state = _sent(client, "/new/preview", text, **box, **changed).json()
     levels = {"enabled": True, "widest_fov_x_deg": 40.0}
     assert tomllib.loads(state["toml"])["products"] == {"levels": levels}
-    state = _sent(client, "/new/preview", text, **own, **{"toml-before": text}).json()
+    state = _sent(client, "/new/preview", text, **usual, **{"toml-before": text}).json()
     assert "enabled" not in state["toml"]
 
 

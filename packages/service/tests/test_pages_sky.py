@@ -46,27 +46,27 @@ def test_a_view_has_the_brightest_stars_and_the_rejected_ones_with_their_reason(
     client, picky_database
 ):
     stars = stars_of(client)
-    guide = [one for one in stars if one["kind"] == "guide"]
+    guide = [star for star in stars if star["kind"] == "guide"]
     table = pq.read_table(picky_database / "stars.parquet").sort_by("mag").to_pylist()
-    assert [one["mag"] for one in guide] == pytest.approx(
+    assert [star["mag"] for star in guide] == pytest.approx(
         [row["mag"] for row in table[:MOST]], abs=1e-4
     )
-    assert {one["label"] for one in guide} <= {row["designation"] for row in table}
-    assert all("reason" not in one for one in guide)
-    rejected = [one for one in stars if one["kind"] == "rejected"]
-    known = {
+    assert {star["label"] for star in guide} <= {row["designation"] for row in table}
+    assert all("reason" not in star for star in guide)
+    rejected = [star for star in stars if star["kind"] == "rejected"]
+    reasons = {
         row["designation"]: row["reason"]
         for row in pq.read_table(picky_database / "rejected.parquet").to_pylist()
         if row["reason"] != "too_faint" and row["mag"] is not None
     }
-    assert {one["label"]: one["reason"].replace(" ", "_") for one in rejected} == known
-    assert set(known.values()) == {"too_bright"}
-    assert not [one for one in stars if one["kind"] == "faint"]
+    assert {star["label"]: star["reason"].replace(" ", "_") for star in rejected} == reasons
+    assert set(reasons.values()) == {"too_bright"}
+    assert not [star for star in stars if star["kind"] == "faint"]
 
 
 def test_a_part_of_the_sky_has_the_stars_within_its_radius(client, picky_database):
     ra, dec, radius = 10.0, 40.0, 25.0
-    found = {one["label"] for one in stars_of(client, ra=ra, dec=dec, radius=radius, faint=True)}
+    labels = {star["label"] for star in stars_of(client, ra=ra, dec=dec, radius=radius, faint=True)}
     middle = directions_from_radec(ra, dec)
     expected = set()
     for name in ("stars", "rejected"):
@@ -77,8 +77,8 @@ def test_a_part_of_the_sky_has_the_stars_within_its_radius(client, picky_databas
         )
         near = np.degrees(separation(u, middle)) <= radius
         expected |= {row["designation"] for row, is_near in zip(rows, near, strict=True) if is_near}
-    assert found == expected
-    assert found
+    assert labels == expected
+    assert labels
     for wrong in ({"ra": 400}, {"dec": -91}, {"radius": 0}, {"ra": "x"}):
         assert client.get(f"{PAGE}/sky.json", params=wrong).status_code == 422
 
@@ -116,10 +116,10 @@ def test_fields_are_ordered_and_filtered_by_their_stars(client, picky_database):
 
     def numbers(query: str) -> list[int]:
         page = client.get(f"{PAGE}/coverage?{query}").text
-        return [int(one) for one in re.findall(r'<tr data-field="(\d+)"', page)]
+        return [int(number) for number in re.findall(r'<tr data-field="(\d+)"', page)]
 
-    found = numbers(f"order=fewest&at_most={few}") + numbers(f"order=fewest&at_most={few}&page=2")
-    assert sorted(found) == [k for k, count in enumerate(stars) if count <= few]
+    fields = numbers(f"order=fewest&at_most={few}") + numbers(f"order=fewest&at_most={few}&page=2")
+    assert sorted(fields) == [k for k, count in enumerate(stars) if count <= few]
     by_dec = numbers("order=dec")
     dec = [float(rows[k].split(",")[2]) for k in by_dec]
     assert dec == sorted(dec)
@@ -131,9 +131,9 @@ def test_places_in_an_answer_are_shown_in_the_sky(client):
     page = client.get(f"{PAGE}/sql", params={"query": asked}).text
     [view] = re.findall(r'data-sky="([^"]+)"', page)
     marks = json.loads(html.unescape(view))["marks"]
-    assert [one["mag"] for one in marks] == sorted(one["mag"] for one in marks)
+    assert [mark["mag"] for mark in marks] == sorted(mark["mag"] for mark in marks)
     assert len(marks) == 5
-    assert all(one["label"].startswith("SAO ") for one in marks)
+    assert all(mark["label"].startswith("SAO ") for mark in marks)
     without = client.get(f"{PAGE}/sql", params={"query": "SELECT count(*) FROM stars"}).text
     assert "data-sky" not in without
 
@@ -150,8 +150,8 @@ def test_what_differs_between_two_databases_is_shown_in_the_sky(
     marks = json.loads(html.unescape(view))["marks"]
     bright = pq.read_table(small_database / "stars.parquet").to_pylist()
     expected = sorted(row["designation"] for row in bright if row["mag"] < 2.2)
-    assert sorted(one["label"] for one in marks) == expected
-    assert {one["reason"] for one in marks} == {"removed"}
+    assert sorted(mark["label"] for mark in marks) == expected
+    assert {mark["reason"] for mark in marks} == {"removed"}
 
 
 # Downloads

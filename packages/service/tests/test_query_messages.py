@@ -186,5 +186,5 @@ def test_a_child_that_keeps_the_pipe_open_does_not_block(tmp_path, monkeypatch):
 @pytest.mark.parametrize("package", ["starcat", "starcat_service"])
 def test_no_module_of_the_package_unpickles(package):
     root = Path(sys.modules[package].__file__ or "").parent
-    found = [path.name for path in root.rglob("*.py") if "import pickle" in path.read_text()]
-    assert found == []
+    unpickling = [path.name for path in root.rglob("*.py") if "import pickle" in path.read_text()]
+    assert unpickling == []

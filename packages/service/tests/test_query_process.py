@@ -63,12 +63,12 @@ def test_nothing_tells_where_the_files_are(session, folder):
     answered = 0
     for text in asked:
         try:
-            told = str(rows_of(session, text, 10_000))
+            answer = str(rows_of(session, text, 10_000))
             answered += 1
         except QueryError as error:
-            told = str(error)
-        for place in (folder.parent, os.getcwd(), Path.home(), tempfile.gettempdir()):
-            assert str(place) not in told, text
+            answer = str(error)
+        for path in (folder.parent, os.getcwd(), Path.home(), tempfile.gettempdir()):
+            assert str(path) not in answer, text
     assert answered > 40
 
 

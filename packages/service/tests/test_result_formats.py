@@ -13,7 +13,7 @@ from starcat.errors import ConfigError, QueryLimitError
 from starcat.ship.exchange.formats import TAP_FORMATS, Format, response_format
 from starcat.ship.exchange.writers import result_chunks
 
-EVERY = pytest.mark.parametrize("asked", TAP_FORMATS, ids=lambda one: one.name)
+EVERY = pytest.mark.parametrize("asked", TAP_FORMATS, ids=lambda tap_format: tap_format.name)
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,11 @@ def test_an_unknown_format_is_refused_with_those_that_there_are(text: str) -> No
     with pytest.raises(ConfigError, match=r"is unknown; choose one of votable.*csv") as caught:
         response_format(text)
     assert len(str(caught.value)) < 300
-    aliases = [alias for one in TAP_FORMATS for alias in (one.name, one.tap_type, *one.aliases)]
+    aliases = [
+        alias
+        for tap_format in TAP_FORMATS
+        for alias in (tap_format.name, tap_format.tap_type, *tap_format.aliases)
+    ]
     assert len(set(aliases)) == len(aliases), "two formats have one alias"
 
 
@@ -66,10 +70,10 @@ def test_what_fails_is_never_taken_for_the_whole(tmp_path: Path, asked: Format) 
 @pytest.mark.parametrize("name", ["fits", "parquet"])
 def test_a_file_is_removed_if_its_reader_stops(tmp_path: Path, name: str) -> None:
     large = pa.table({"a": np.random.default_rng(1).normal(size=100_000)})
-    given = result_chunks(large.to_reader(), response_format(name), tmp_path)
-    next(given)
+    chunks = result_chunks(large.to_reader(), response_format(name), tmp_path)
+    next(chunks)
     assert list(tmp_path.iterdir())
-    given.close()  # type: ignore[attr-defined]
+    chunks.close()  # type: ignore[attr-defined]
     assert not list(tmp_path.iterdir())
     unread = result_chunks(large.to_reader(), response_format(name), tmp_path)
     del unread

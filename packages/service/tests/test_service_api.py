@@ -26,7 +26,7 @@ API = f"/api/v1/databases/{DATABASE}"
 
 
 @pytest.fixture
-def own(own_root: Path) -> Iterator[TestClient]:
+def own_client(own_root: Path) -> Iterator[TestClient]:
     """A client of a service of the test's own."""
     with client_of(own_root, **PUBLIC) as client:
         yield client
@@ -38,13 +38,13 @@ def manifest_of(folder: Path) -> dict:
 
 def test_databases_are_listed_with_their_facts(client, small_database):
     listed = client.get("/api/v1/databases").json()["databases"]
-    [one] = [found for found in listed if found["id"] == DATABASE]
+    [facts] = [database for database in listed if database["id"] == DATABASE]
     manifest = manifest_of(small_database)
-    assert one["id"] == DATABASE
-    assert one["title"] == "small-1.0.0"
-    assert one["stars"] == manifest["products"]["stars"]["rows"]
-    assert one["manifest_sha256"] == manifest["manifest_sha256"]
-    assert client.get(API).json() == one
+    assert facts["id"] == DATABASE
+    assert facts["title"] == "small-1.0.0"
+    assert facts["stars"] == manifest["products"]["stars"]["rows"]
+    assert facts["manifest_sha256"] == manifest["manifest_sha256"]
+    assert client.get(API).json() == facts
 
 
 def test_the_manifest_comes_once(client, small_database):
@@ -72,16 +72,16 @@ def test_report_and_coverage_are_those_of_the_build(client, small_database):
 def test_every_file_of_the_list_can_be_had(client, small_database):
     listed = client.get(f"{API}/files").json()
     on_disk = {str(p.relative_to(small_database)) for p in small_database.rglob("*") if p.is_file()}
-    assert {one["path"] for one in listed} == on_disk
-    for one in listed:
-        answer = client.get(f"{API}/files/{one['path']}")
-        assert hashlib.sha256(answer.content).hexdigest() == one["sha256"]
-        assert answer.headers["etag"] == f'"{one["sha256"]}"'
-        assert answer.headers["content-type"] == one["content_type"]
+    assert {file["path"] for file in listed} == on_disk
+    for file in listed:
+        answer = client.get(f"{API}/files/{file['path']}")
+        assert hashlib.sha256(answer.content).hexdigest() == file["sha256"]
+        assert answer.headers["etag"] == f'"{file["sha256"]}"'
+        assert answer.headers["content-type"] == file["content_type"]
         assert answer.headers["content-disposition"].startswith("attachment")
         assert "immutable" in answer.headers["cache-control"]
-        head = client.head(f"{API}/files/{one['path']}")
-        assert (head.content, int(head.headers["content-length"])) == (b"", one["bytes"])
+        head = client.head(f"{API}/files/{file['path']}")
+        assert (head.content, int(head.headers["content-length"])) == (b"", file["bytes"])
 
 
 PARTS = {
@@ -99,8 +99,8 @@ def test_a_range_is_a_part(client, small_database):
     for asked, (start, end) in PARTS.items():
         answer = client.get(path, headers={"Range": asked})
         assert (answer.status_code, answer.content) == (206, data[start:end]), asked
-        told = f"bytes {start % size}-{(end or size) - 1}/{size}"
-        assert answer.headers["content-range"] == told
+        content_range = f"bytes {start % size}-{(end or size) - 1}/{size}"
+        assert answer.headers["content-range"] == content_range
     for asked in WHOLE:  # several ranges, or invalid ones
         answer = client.get(path, headers={"Range": asked})
         assert (answer.status_code, answer.content) == (200, data), asked
@@ -113,18 +113,18 @@ def test_a_range_is_a_part(client, small_database):
     assert client.get(path, headers={**first, "If-Range": '"another"'}).status_code == 200
 
 
-def test_only_files_of_the_manifest_are_there(own, own_root, tmp_path):
+def test_only_files_of_the_manifest_are_there(own_client, own_root, tmp_path):
     folder = own_root / "databases" / DATABASE / "small-1.0.0"
     (folder / "secret.txt").write_text("secret")
     for path in ("../small-1.0.0.build.json", "report", "STARS.parquet", "secret.txt"):
-        assert own.get(f"{API}/files/{path}").status_code in (400, 404), path
+        assert own_client.get(f"{API}/files/{path}").status_code in (400, 404), path
     stars = folder / "stars.parquet"
     (tmp_path / "elsewhere").write_bytes(stars.read_bytes())
     stars.unlink()
     stars.symlink_to(tmp_path / "elsewhere")
-    assert own.get(f"{API}/files/stars.parquet").status_code == 404
+    assert own_client.get(f"{API}/files/stars.parquet").status_code == 404
     stars.unlink()
-    assert own.get(f"{API}/files/stars.parquet").status_code == 404
+    assert own_client.get(f"{API}/files/stars.parquet").status_code == 404
 
 
 def test_the_archive_is_the_database(client, tmp_path):
@@ -135,23 +135,23 @@ def test_the_archive_is_the_database(client, tmp_path):
     assert client.get(f"{API}/archive").content == answer.content
 
 
-def test_two_databases_are_compared(own, own_root, database_version):
+def test_two_databases_are_compared(own_client, own_root, database_version):
     add_database(own_root, database_version("1.1.0"), OTHER)
-    found = own.get(f"{API}/diff/{OTHER}").json()
-    assert [change["name"] for change in found["spec"]] == ["version"]
-    assert found["counts"] == {"came": 0, "went": 0, "moved": 0}
-    assert own.get(f"{API}/diff/{DATABASE}").json()["is_same"]
-    assert own.get(f"{API}/diff/{'0' * 16}").status_code == 404
+    difference = own_client.get(f"{API}/diff/{OTHER}").json()
+    assert [change["name"] for change in difference["spec"]] == ["version"]
+    assert difference["counts"] == {"came": 0, "went": 0, "moved": 0}
+    assert own_client.get(f"{API}/diff/{DATABASE}").json()["is_same"]
+    assert own_client.get(f"{API}/diff/{'0' * 16}").status_code == 404
 
 
-def test_publishing_makes_a_release_that_can_be_pulled(own, own_root, tmp_path):
-    first = own.post("/api/v1/releases", json={"database": DATABASE, "note": "<b>first</b>"})
+def test_publishing_makes_a_release_that_can_be_pulled(own_client, own_root, tmp_path):
+    first = own_client.post("/api/v1/releases", json={"database": DATABASE, "note": "<b>first</b>"})
     assert (first.status_code, first.json()["outcome"]) == (201, "published")
-    again = own.post("/api/v1/releases", json={"database": DATABASE, "note": "again"})
+    again = own_client.post("/api/v1/releases", json={"database": DATABASE, "note": "again"})
     assert (again.status_code, again.json()["outcome"]) == (200, "unchanged")
-    [listed] = own.get("/api/v1/releases").json()["releases"]
+    [listed] = own_client.get("/api/v1/releases").json()["releases"]
     assert (listed["note"], listed["owner"]) == ("<b>first</b>", "anonymous")
-    assert listed == own.get("/api/v1/releases/small/1.0.0").json()
+    assert listed == own_client.get("/api/v1/releases/small/1.0.0").json()
     [release] = FolderRegistry(own_root / "registry").releases()
     assert release.title == "small-1.0.0"
     pull_release(FolderRegistry(own_root / "registry"), release, tmp_path / "out")
@@ -173,8 +173,8 @@ def test_what_the_service_publishes_is_signed_with_its_operators_key(
             assert client.get(f"/registry/metadata/{path}").status_code == 404
     places = {"output": tmp_path / "out", "lock": tmp_path / "lock"}
     registry = str(own_root / "registry")
-    one = pull("small", registry, options=DownloadOptions(), trust=public, **places)
-    assert (one.folder.name, one.signed) == ("small-1.0.0", "checked")
+    pulled = pull("small", registry, options=DownloadOptions(), trust=public, **places)
+    assert (pulled.folder.name, pulled.signed) == ("small-1.0.0", "checked")
     with client_of(own_root, **PUBLIC) as client:
         ran = client.post("/api/v1/releases", json={"database": DATABASE})
         assert ran.status_code == 422
@@ -190,23 +190,23 @@ def test_a_key_among_the_files_of_the_service_is_refused(tmp_path):
         read_settings(tmp_path / "other", signing_key=public)
 
 
-def test_the_registry_is_its_own_files_only(own, own_root):
-    assert own.get("/registry/index.json").status_code == 404
-    own.post("/api/v1/releases", json={"database": DATABASE})
+def test_the_registry_is_its_own_files_only(own_client, own_root):
+    assert own_client.get("/registry/index.json").status_code == 404
+    own_client.post("/api/v1/releases", json={"database": DATABASE})
     (own_root / "registry" / ".lock").touch()
-    index = own.get("/registry/index.json")
+    index = own_client.get("/registry/index.json")
     assert index.content == (own_root / "registry" / "index.json").read_bytes()
     assert "no-cache" in index.headers["cache-control"]
     tag = {"If-None-Match": index.headers["etag"]}
-    assert own.get("/registry/index.json", headers=tag).status_code == 304
-    release = own.get("/registry/versions/small/1.0.0.json").json()
+    assert own_client.get("/registry/index.json", headers=tag).status_code == 304
+    release = own_client.get("/registry/versions/small/1.0.0.json").json()
     digest = release["manifest"]["sha256"]
     path = f"/registry/blobs/sha256/{digest[:2]}/{digest}"
-    blob = own.get(path)
+    blob = own_client.get(path)
     assert hashlib.sha256(blob.content).hexdigest() == digest
     assert "immutable" in blob.headers["cache-control"]
-    part = own.get(path, headers={"Range": "bytes=3-"})
+    part = own_client.get(path, headers={"Range": "bytes=3-"})
     assert (part.status_code, part.content) == (206, blob.content[3:])
-    assert own.head(path).status_code == 200
+    assert own_client.head(path).status_code == 200
     for other in ("", "versions/small/01.0.0.json", f"blobs/sha256/00/{'0' * 64}", ".incoming/x"):
-        assert own.get(f"/registry/{other}").status_code in (400, 404), other
+        assert own_client.get(f"/registry/{other}").status_code in (400, 404), other

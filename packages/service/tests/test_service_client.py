@@ -33,11 +33,11 @@ def spec_of(small_spec: str, name: str) -> str:
 
 @pytest.mark.slow
 def test_a_database_is_built_there_and_brought_here(client, small_spec, tmp_path):
-    told: list[str] = []
+    stages: list[str] = []
     spec = spec_of(small_spec, "there")
-    job = client.build(spec, lambda stage, done, total: told.append(stage))
+    job = client.build(spec, lambda stage, done, total: stages.append(stage))
     database = job["result"]["database"]
-    assert told
+    assert stages
     folder, outcome = client.download(database, tmp_path)
     assert (folder, outcome) == (tmp_path / "there-1.0.0", "written")
     assert not verify(folder).findings
@@ -54,8 +54,8 @@ def test_the_command_builds_as_it_does_here(remote, starcat, small_spec, sao_lin
     (tmp_path / "spec.toml").write_text(spec_of(small_spec, "both"))
     (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
     there = remote("build", tmp_path / "spec.toml", "--json", "-o", tmp_path / "there")
-    given = ["--input", f"sao={tmp_path / 'sao.dat'}", "--json", "-o", tmp_path / "here"]
-    here = starcat(["build", tmp_path / "spec.toml", *given])
+    options = ["--input", f"sao={tmp_path / 'sao.dat'}", "--json", "-o", tmp_path / "here"]
+    here = starcat(["build", tmp_path / "spec.toml", *options])
     assert (there.code, here.code) == (0, 0), there.err
     mine, theirs = json.loads(here.out), json.loads(there.out)
     assert theirs["products"] == mine["products"]
@@ -130,7 +130,7 @@ def test_a_published_database_is_pulled_as_from_any_registry(client, served, sta
     assert ran.code == 0, ran.err
     assert not verify(tmp_path / "out" / "small-1.0.0").findings
     ran = starcat(["releases", f"{served.address}/registry", "--json"])
-    assert [one["version"] for one in json.loads(ran.out)] == ["1.0.0"]
+    assert [release["version"] for release in json.loads(ran.out)] == ["1.0.0"]
 
 
 def test_errors_are_those_of_the_library(client, served, tmp_path):

@@ -89,11 +89,11 @@ HOSTILE = {
 def test_a_folder_that_is_not_a_database_gets_no_place(service, job, tmp_path):
     before = sorted(tmp_path.rglob("*"))
     for name, content in HOSTILE.items():
-        made = ServicePaths(tmp_path / "made")
-        made.root.mkdir()
+        unpacked = ServicePaths(tmp_path / "made")
+        unpacked.root.mkdir()
         with pytest.raises((ProductError, tarfile.TarError, OSError)):
-            store_result(content, job, made, service.paths)
-        shutil.rmtree(made.root)
+            store_result(content, job, unpacked, service.paths)
+        shutil.rmtree(unpacked.root)
         assert sorted(tmp_path.rglob("*")) == before, name
 
 
@@ -107,20 +107,22 @@ def built(root: Path, job: Job, database: Path) -> bytes:
 def test_only_the_whole_database_of_the_job_gets_its_place(
     service, job, tmp_path, small_database, database_version
 ):
-    made = ServicePaths(tmp_path / "made")
+    unpacked = ServicePaths(tmp_path / "made")
     with pytest.raises(ProductError):
         store_result(
-            built(tmp_path / "b", job, database_version("2.0.0")), job, made, service.paths
+            built(tmp_path / "b", job, database_version("2.0.0")), job, unpacked, service.paths
         )
     archive = bytearray(built(tmp_path / "a", job, small_database))
     archive[archive.index(b"PAR1", len(archive) // 2) - 100] ^= 1
     for damaged in (bytes(archive), bytes(archive[: len(archive) // 2])):
         with pytest.raises((ProductError, tarfile.TarError)):
-            store_result(damaged, job, made, service.paths)
+            store_result(damaged, job, unpacked, service.paths)
     assert service.library.databases() == []
-    shutil.rmtree(made.root)
+    shutil.rmtree(unpacked.root)
     for _ in range(2):  # Dask may do a task twice
-        store_result(pack(tmp_path / "a", tmp_path / "a" / "databases"), job, made, service.paths)
+        store_result(
+            pack(tmp_path / "a", tmp_path / "a" / "databases"), job, unpacked, service.paths
+        )
     [database] = service.library.databases()
     assert verify(database.folder).findings == ()
     assert {path.stat().st_mode & 0o222 for path in database.folder.iterdir()} == {0}

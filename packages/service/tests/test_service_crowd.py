@@ -200,19 +200,21 @@ def test_a_crowd_keeps_no_page_of_another_user_waiting(
         body = json.dumps(content).encode()
         return request(crowded, "POST", f"/api/v1/specs/{path}", body, JSON)[0]
 
-    found: list[str] = []
-    camera_of = threading.Thread(target=lambda: found.append(with_camera(crowded, pictures)))
+    cameras: list[str] = []
+    camera_of = threading.Thread(target=lambda: cameras.append(with_camera(crowded, pictures)))
     camera_of.start()
     crowd.run(send)
     camera_of.join()
-    told = {code: crowd.statuses.count(code) for code in sorted(set(crowd.statuses))}
+    counts = {code: crowd.statuses.count(code) for code in sorted(set(crowd.statuses))}
     sys.stdout.write(
-        f"{kind}: {told}; pages of another user: quiet at most {max(quiet.page_s):.2f} s, "
+        f"{kind}: {counts}; pages of another user: quiet at most {max(quiet.page_s):.2f} s, "
         f"meanwhile {max(crowd.page_s):.2f} s ({len(crowd.page_s)} pages); the server had at most "
         f"{memory_bytes(crowded) / 1e6:.0f} MB\n"
     )
-    assert found == [one for one in found if "2 of them identified" in one], found
+    assert cameras == [
+        camera_text for camera_text in cameras if "2 of them identified" in camera_text
+    ], cameras
     assert "2 of them identified" in with_camera(crowded, pictures)
-    assert set(told) <= {200, 503}
+    assert set(counts) <= {200, 503}
     assert max(crowd.page_s) < max(MAX_PAGE_S, 4.0 * max(quiet.page_s))
     assert memory_bytes(crowded) < MAX_SERVER_BYTES

@@ -28,8 +28,8 @@ PAIRS = "SELECT a.i AS i, b.j AS j FROM small.pairs AS a, small.pairs AS b"
 
 def run(client: TestClient, query: str, **more: str) -> str:
     """Have a query answered asynchronously; return the id of its job."""
-    given = {"QUERY": query, "PHASE": "RUN", "RESPONSEFORMAT": "csv", **more}
-    answer = client.post("/tap/async", data=given, follow_redirects=False)
+    parameters = {"QUERY": query, "PHASE": "RUN", "RESPONSEFORMAT": "csv", **more}
+    answer = client.post("/tap/async", data=parameters, follow_redirects=False)
     assert answer.status_code == 303, answer.text
     job = answer.headers["location"].rpartition("/")[2]
     until(lambda: client.get(f"/tap/async/{job}/phase").text not in ("QUEUED", "EXECUTING"))
@@ -55,8 +55,13 @@ def test_results_of_tap_have_a_quota_and_the_oldest_go_first(own_root: Path) -> 
     with client_of(own_root, disk_gib=2.7 * size / GIB) as client:
         other, mine = (at(client, f"192.0.2.{number}") for number in (1, 2))
         kept = run(other, "SELECT TOP 3 i, j FROM small.pairs")
-        made = [run(mine, query) for _ in range(4)]
-        assert [phase_of(mine, job) for job in made] == ["gone", "gone", "COMPLETED", "COMPLETED"]
+        jobs_of_mine = [run(mine, query) for _ in range(4)]
+        assert [phase_of(mine, job) for job in jobs_of_mine] == [
+            "gone",
+            "gone",
+            "COMPLETED",
+            "COMPLETED",
+        ]
         assert phase_of(other, kept) == "COMPLETED", "others keep theirs"
         large = run(mine, query.replace("20000", "80000"))
         assert phase_of(mine, large) == "ERROR"
@@ -66,13 +71,13 @@ def test_results_of_tap_have_a_quota_and_the_oldest_go_first(own_root: Path) -> 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 120 MiB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=120m", "tmpfs", str(place)]
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=120m", "tmpfs", str(folder)]
     if sys.platform != "linux" or subprocess.run(command, capture_output=True).returncode:
         pytest.skip("a disk can be mounted by root of Linux only")
-    yield place
-    subprocess.run(["umount", "-l", str(place)], check=True)
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
 FREE_GIB = 0.02

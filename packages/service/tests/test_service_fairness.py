@@ -24,7 +24,7 @@ from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.problems import Problem, problem_of
 from starcat_service.sandbox import query_engine
 from starcat_service.sandbox.limiter import Limiter, asker
-from starcat_service.sandbox.pool import SHORT_SLOTS, SHORT_S, Pool, QueryPool
+from starcat_service.sandbox.pool import SHORT_S, SHORT_SLOTS, Pool, QueryPool
 from starcat_service.sandbox.query_engine import ConfinedEngine
 from starcat_service.sandbox.sandbox import Sandbox
 from starcat_service.security.request_limits import OWN_CONNECTIONS, Shares
@@ -44,37 +44,37 @@ def pool(tmp_path: Path) -> Iterator[QueryPool]:
 # Places.
 
 
-_held: list[ExitStack] = []  # a slot without a reference would be given back
+_stacks: list[ExitStack] = []  # a slot without a reference would be given back
 
 
 def taken(shared: Limiter, who: str) -> ExitStack | None:
     """Return a place of a client that is given back by ``close``, None if there is none at once."""
-    held = ExitStack()
+    stack = ExitStack()
     try:
-        held.enter_context(shared.hold(who, 0.0))
+        stack.enter_context(shared.hold(who, 0.0))
     except Problem:
         return None
-    _held.append(held)
-    return held
+    _stacks.append(stack)
+    return stack
 
 
 def test_a_client_has_another_place_only_where_more_are_free_and_so_many_at_most():
     shared = Limiter(4, 2)
-    places = [taken(shared, "greedy") for _ in range(3)]
-    assert [place is not None for place in places] == [True, True, False]
+    slots = [taken(shared, "greedy") for _ in range(3)]
+    assert [slot is not None for slot in slots] == [True, True, False]
     assert taken(shared, "anna")
     assert taken(shared, "anna") is None
     assert taken(shared, "bob")
     assert taken(shared, "carl") is None
-    assert places[0] is not None
-    places[0].close()
+    assert slots[0] is not None
+    slots[0].close()
     assert taken(shared, "greedy") is None
     assert taken(shared, "carl")
 
 
 def test_a_free_place_is_for_who_holds_fewest_and_then_for_who_waits_in_turn():
     shared, order = Limiter(2, 1), list[str]()
-    held = {who: taken(shared, who) for who in ("greedy", "anna")}
+    stacks = {who: taken(shared, who) for who in ("greedy", "anna")}
 
     def wait(who: str) -> None:
         with shared.hold(who, 10.0):
@@ -86,11 +86,11 @@ def test_a_free_place_is_for_who_holds_fewest_and_then_for_who_waits_in_turn():
         threads[-1].start()
         while len(shared._waiting) < number:
             time.sleep(0.001)
-    held["anna"].close()
+    stacks["anna"].close()
     for thread in threads[-3:]:
         thread.join(10.0)
     assert order[:3] == ["anna", "bob", "anna"], "greedy asked before both, and holds a place"
-    held["greedy"].close()
+    stacks["greedy"].close()
     for thread in threads:
         thread.join(10.0)
     assert order[3:] == ["greedy"] * 2
@@ -104,9 +104,9 @@ def test_a_request_that_waits_too_long_has_to_be_repeated():
         assert caught.value.status == 503
         assert int(caught.value.headers["Retry-After"]) >= 1
         asker.set("anna")
-        with pytest.raises(Problem, match=r"1 of your requests took more than 0\.01 s") as own:
+        with pytest.raises(Problem, match=r"1 of your requests took more than 0\.01 s") as refused:
             asyncio.run(shared.run(0.01, str))
-        assert own.value.status == 429
+        assert refused.value.status == 429
     assert taken(shared, "bob"), "a client that went away does not keep the place"
 
 
@@ -129,9 +129,9 @@ def test_a_place_is_held_as_long_as_something_uses_it():
     shared, using = Limiter(1, 1), ExitStack()
 
     def begin() -> None:
-        place = shared.slot.get()
-        assert place is not None
-        using.enter_context(place.used())
+        slot = shared.slot.get()
+        assert slot is not None
+        using.enter_context(slot.used())
 
     asyncio.run(shared.run(1.0, begin))
     assert taken(shared, "anna") is None
@@ -177,19 +177,19 @@ def test_short_queries_pass_those_that_take_long(pool, small_database):
 
 
 def test_check_and_run_have_one_allowance(small_database, monkeypatch):
-    given: list[tuple[str, object]] = []
-    own = ConfinedEngine.ask
+    requests: list[tuple[str, object]] = []
+    original = ConfinedEngine.ask
 
     def noted(self: ConfinedEngine, name: str, *arguments: Any, **options: Any) -> Any:
-        given.append((name, options.get("allowance")))
-        return own(self, name, *arguments, **options)
+        requests.append((name, options.get("allowance")))
+        return original(self, name, *arguments, **options)
 
     with open_session([str(small_database)], new_engine=ConfinedEngine) as session:
         monkeypatch.setattr(ConfinedEngine, "ask", noted)
         with session.ask("SELECT count(*) FROM stars") as running:
             running.rows(1)
-    assert [name for name, _ in given] == ["check", "rows"]
-    assert given[0][1] is given[1][1] is not None
+    assert [name for name, _ in requests] == ["check", "rows"]
+    assert requests[0][1] is requests[1][1] is not None
 
 
 def test_a_request_has_one_allowance(pool, small_database):
@@ -221,15 +221,15 @@ def test_the_next_session_gets_a_process_that_was_started_in_advance(
 @pytest.mark.timeout(60)
 def test_answers_of_tap_hold_a_place_until_they_are_sent(root):
     with client_of(root, queries=2) as client:
-        found = [
+        answers = [
             client.get("/tap/sync", params={"QUERY": query, "FORMAT": "csv"})
             for query in (
                 "SELECT TOP 3 i, j FROM small.pairs ORDER BY i, j",
                 "SELECT COUNT(*) AS n FROM small.pairs AS a, small.stars AS b WHERE a.i < b.mag",
             )
         ]
-        assert [one.status_code for one in found] == [200, 200]
-        assert [one.text.count("\n") for one in found] == [4, 2]
+        assert [answer.status_code for answer in answers] == [200, 200]
+        assert [answer.text.count("\n") for answer in answers] == [4, 2]
         limiter = client.app.state.service.query_pool._limiter
         assert limiter._free == SHORT_SLOTS + 2, "all slots are given back"
 
@@ -241,10 +241,10 @@ def client_at(client: TestClient, address: str) -> TestClient:
 def test_jobs_of_tap_are_shared_by_address(root, monkeypatch):
     monkeypatch.setattr(tap_jobs, "MAX_WAITING", 2)
     with client_of(root) as client:
-        one, other = (client_at(client, address) for address in ("192.0.2.1", "192.0.2.2"))
-        for at in (one, one, other):
+        first, other = (client_at(client, address) for address in ("192.0.2.1", "192.0.2.2"))
+        for at in (first, first, other):
             assert at.post("/tap/async", data={"QUERY": "SELECT 1"}).status_code == 200
-        refused = one.post("/tap/async", data={"QUERY": "SELECT 1"})
+        refused = first.post("/tap/async", data={"QUERY": "SELECT 1"})
         assert refused.status_code == 422
         assert "2 of your jobs have not ended" in refused.text
         assert other.post("/tap/async", data={"QUERY": "SELECT 1"}).status_code == 200
@@ -276,11 +276,11 @@ def test_jobs_that_wait_are_begun_in_turns(root):
 
 def test_requests_at_the_same_time_are_counted_by_user():
     shares = Shares(1)
-    with shares.one("anna"), shares.one("bob"):
-        with pytest.raises(Problem) as caught, shares.one("anna"):
+    with shares.counted("anna"), shares.counted("bob"):
+        with pytest.raises(Problem) as caught, shares.counted("anna"):
             pass
         assert caught.value.status == 429
-    with shares.one("anna"):
+    with shares.counted("anna"):
         pass
 
 
@@ -289,8 +289,8 @@ def test_connections_are_shared_by_address(tmp_path, small_database):
     add_database(tmp_path / "root", small_database)
     with serve(tmp_path / "root", tmp_path / "log") as served:
 
-        def connection(own: str) -> socket.socket:
-            return socket.create_connection(("127.0.0.1", served.port), 10.0, (own, 0))
+        def connection(source_ip: str) -> socket.socket:
+            return socket.create_connection(("127.0.0.1", served.port), 10.0, (source_ip, 0))
 
         lines = [connection("127.0.0.1") for _ in range(OWN_CONNECTIONS)]
         try:
@@ -338,9 +338,9 @@ class Starved:
 def test_a_starved_process_is_not_told_to_send_less(tmp_path, fraction, words, status):
     sandbox = Sandbox(ServiceSettings(root=tmp_path, query_time_s=0.1), tmp_path)
     began_s = time.monotonic()
-    with pytest.raises((Problem, QueryLimitError), match=words) as told:
+    with pytest.raises((Problem, QueryLimitError), match=words) as caught:
         sandbox._answer(Starved(fraction), ["identify", {}, 0.1])
-    assert problem_of(told.value).status == status
+    assert problem_of(caught.value).status == status
     assert (time.monotonic() - began_s > 0.28) == (status == 503), "it had more time"
     sandbox.close()
 
@@ -420,7 +420,7 @@ def test_only_some_are_kept(single, database_version):
     for version in ("1.0.0", "1.1.0"):
         with single.session([database_version(version)]) as session:
             processes.append(process_of(session))
-    assert [is_there(one) for one in processes] == [False, True]
+    assert [is_there(process) for process in processes] == [False, True]
 
 
 def test_a_target_that_was_replaced_is_opened_again(single, small_database, tmp_path):

@@ -81,7 +81,7 @@ def bodies(key: str, value: Any) -> Iterator[Shape]:
     content, text = with_key(key, value), tomlkit.item(value).as_string()
     table, _, name = key.rpartition(".")
     inline = {table: f"{{{name} = {text}}}"}
-    given = {key: str(value)}
+    keys = {key: str(value)}
     dotted = f"{SPEC}\n[{table}]\n{name} = {text}\n"
     arrays = f"{SPEC}\n[[{table}]]\n{name} = {text}\n"
     of_preset = {"preset": "gaia-12deg"}
@@ -89,7 +89,7 @@ def bodies(key: str, value: Any) -> Iterator[Shape]:
     yield "toml", {"json": {"toml": as_toml(content)}}
     yield "dotted", {"json": {"toml": dotted}}
     yield "arrays", {"json": {"toml": arrays}}
-    for changes in (given, inline, {table.partition(".")[0]: inline_of(content, table)}):
+    for changes in (keys, inline, {table.partition(".")[0]: inline_of(content, table)}):
         yield "changes", {"json": {**of_preset, "changes": changes}}
         yield "changed spec", {"json": {"spec": tomllib.loads(SPEC), "changes": changes}}
         yield "changed toml", {"json": {"toml": SPEC, "changes": changes}}

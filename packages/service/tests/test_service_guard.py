@@ -63,12 +63,12 @@ def make(tmp_path: Path) -> Iterator[Make]:
     """Clients of services with settings, each at 127.0.0.1 by default."""
     opened = []
 
-    def made(**options: Any) -> TestClient:
+    def client(**options: Any) -> TestClient:
         app = with_probes(make_app(read_settings(tmp_path / "root", **options)))
         opened.append(app)
         return TestClient(app, base_url="http://127.0.0.1")
 
-    yield made
+    yield client
     for app in opened:
         app.state.service.records.close()
 
@@ -102,7 +102,7 @@ def test_a_token_is_kept_as_a_digest_only(make):
     app: Any = at.app
     path = app.state.service.paths.records
     app.state.service.records.close()
-    written = b"".join(one.read_bytes() for one in path.parent.glob("records.sqlite*"))
+    written = b"".join(file.read_bytes() for file in path.parent.glob("records.sqlite*"))
     assert b"anna" in written
     assert text.encode() not in written
     assert text.removeprefix("starcat_").encode() not in written
@@ -125,10 +125,10 @@ def test_a_token_gives_its_role_by_each_way_to_send_it(client):
 )
 def test_a_wrong_token_is_refused_also_if_no_token_is_needed(client, wrong):
     header = {"Authorization": f"Bearer {wrong}".encode("latin-1")}
-    found = client.get("/probe/who", headers=header)
-    assert found.status_code == 401
-    assert found.headers["content-type"] == "application/problem+json"
-    assert "not valid" in found.json()["detail"]
+    answer = client.get("/probe/who", headers=header)
+    assert answer.status_code == 401
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert "not valid" in answer.json()["detail"]
 
 
 def test_expired_and_revoked_tokens_are_worth_nothing(client, monkeypatch):
@@ -147,13 +147,13 @@ def test_expired_and_revoked_tokens_are_worth_nothing(client, monkeypatch):
 
 
 def test_a_known_token_is_accepted_without_a_look_up(client, monkeypatch):
-    text, found, asked = token_for(client, "dora"), list[int](), TokenStore.find
+    text, lookups, asked = token_for(client, "dora"), list[int](), TokenStore.find
     monkeypatch.setattr(
-        TokenStore, "find", lambda self, text: (found.append(1), asked(self, text))[1]
+        TokenStore, "find", lambda self, text: (lookups.append(1), asked(self, text))[1]
     )
     for _ in range(5):
         assert client.get("/probe/who", headers=bearer(text)).json()["name"] == "dora"
-    assert len(found) == 1
+    assert len(lookups) == 1
 
 
 def test_one_valid_token_has_a_plain_name(client):
@@ -172,7 +172,7 @@ def test_guessing_is_slowed_down_and_the_right_token_still_goes_through(make):
     at = make()
     text = token_for(at, "anna")
     wrong = [at.get("/probe/who", headers=bearer(f"starcat_{k}")) for k in range(15)]
-    assert [one.status_code for one in wrong] == [401] * 10 + [429] * 5
+    assert [answer.status_code for answer in wrong] == [401] * 10 + [429] * 5
     assert 1 <= int(wrong[-1].headers["retry-after"]) <= 6
     assert at.post("/sign-in", data={"token": "starcat_wrong"}).status_code == 429
     assert at.get("/probe/who", headers=bearer(text)).status_code == 200
@@ -190,8 +190,8 @@ def test_a_sign_in_is_a_cookie_that_is_not_the_token(make):
     assert "Secure" not in cookie
     assert at.get("/probe/who").json() == {"name": "anna", "role": "PUBLISHER"}
     secret = at.cookies["starcat-8000"]
-    own = {"Origin": "http://127.0.0.1"}
-    assert at.post("/sign-out", headers=own, follow_redirects=False).status_code == 303
+    same_origin = {"Origin": "http://127.0.0.1"}
+    assert at.post("/sign-out", headers=same_origin, follow_redirects=False).status_code == 303
     at.cookies.set("starcat-8000", secret)
     assert at.get("/probe/who").json()["name"] == "anonymous"
 
@@ -212,11 +212,11 @@ def test_a_sign_in_ends_with_its_time_and_with_its_token(make, monkeypatch):
 
 
 def test_a_wrong_token_of_a_sign_in_shows_the_form_again(client):
-    found = client.post("/sign-in", data={"token": "starcat_x", "next": "//evil.example"})
-    assert found.status_code == 401
-    assert "not valid" in found.text
-    assert "evil.example" not in found.text
-    assert "set-cookie" not in found.headers
+    answer = client.post("/sign-in", data={"token": "starcat_x", "next": "//evil.example"})
+    assert answer.status_code == 401
+    assert "not valid" in answer.text
+    assert "evil.example" not in answer.text
+    assert "set-cookie" not in answer.headers
 
 
 OTHERS = [{"host": "0.0.0.0"}, {"public_url": "https://stars.example"}]
@@ -229,9 +229,9 @@ def test_others_than_this_machine_need_a_token_for_all_but_signing_in(make, tmp_
     at = make(**options)
     text = token_for(at, "anna")
     for path in ("/probe/who", "/metrics", "/readyz", "/api/openapi.json", "/nothing"):
-        found = at.get(path)
-        assert found.status_code == 401, path
-        assert found.headers["www-authenticate"] == 'Bearer realm="starcat"'
+        answer = at.get(path)
+        assert answer.status_code == 401, path
+        assert answer.headers["www-authenticate"] == 'Bearer realm="starcat"'
     assert at.get("/tap/tables").headers["www-authenticate"].startswith("Basic ")
     for path in ("/sign-inx", "/healthzx", "/api/uploads", "/tap/availability/x"):
         assert at.get(path).status_code == 401, "it only begins as an open path"
@@ -252,9 +252,9 @@ def test_others_than_this_machine_need_a_token_for_all_but_signing_in(make, tmp_
 def test_requests_of_one_address_or_token_are_limited(make):
     at = make(requests_per_minute=1)
     text = token_for(at, "anna")
-    found = [at.get("/probe/who") for _ in range(3)]
-    assert [one.status_code for one in found] == [200, 429, 429]
-    assert 1 <= int(found[-1].headers["retry-after"]) <= 60
+    answers = [at.get("/probe/who") for _ in range(3)]
+    assert [answer.status_code for answer in answers] == [200, 429, 429]
+    assert 1 <= int(answers[-1].headers["retry-after"]) <= 60
     assert at.get("/healthz").status_code == 200
     assert at.get("/probe/who", headers=bearer(text)).status_code == 200
 
@@ -287,7 +287,10 @@ HONEST = [
 
 def test_what_another_site_makes_a_browser_send_is_refused(make):
     at = make(anonymous="publisher")
-    for headers, status in (*((one, 403) for one in FORGED), *((one, 200) for one in HONEST)):
+    for headers, status in (
+        *((origin, 403) for origin in FORGED),
+        *((origin, 200) for origin in HONEST),
+    ):
         assert at.post("/probe/body", headers=headers).status_code == status, headers
         assert at.get("/probe/who", headers=headers).status_code == 200, headers
 
@@ -305,8 +308,8 @@ HOSTS = [
 @pytest.mark.parametrize(("options", "hosts"), HOSTS)
 def test_a_name_that_is_not_ours_is_refused(make, options, hosts):
     at = make(**options)
-    found = {host: at.get("/healthz", headers={"Host": host}).status_code for host in hosts}
-    assert found == hosts
+    statuses = {host: at.get("/healthz", headers={"Host": host}).status_code for host in hosts}
+    assert statuses == hosts
 
 
 TARGETS = {
@@ -344,21 +347,21 @@ def test_a_body_is_too_large_by_what_it_says_and_by_what_it_is(make):
 
 def test_nothing_is_added_to_a_full_disk(client, monkeypatch):
     monkeypatch.setattr(request_limits, "free_gib", lambda folder: 0.99)
-    found = client.post("/probe/body", files={"file": b"x"})
-    assert found.status_code == 507
-    assert "0.99 GiB free, and 1 have to be left" in found.json()["detail"]
+    answer = client.post("/probe/body", files={"file": b"x"})
+    assert answer.status_code == 507
+    assert "0.99 GiB free, and 1 have to be left" in answer.json()["detail"]
     assert client.post("/probe/body", content=b"x").status_code == 200
     assert client.get("/probe/who").status_code == 200
 
 
 def test_a_defect_tells_the_log_and_not_the_client(client, caplog, monkeypatch):
-    found = client.get("/probe/broken", headers={"X-Request-ID": "mine-1"})
-    assert found.status_code == 500
-    assert "secret words" not in found.text
-    assert "Traceback" not in found.text
-    assert found.headers["x-request-id"] == "mine-1"
-    assert found.headers["content-security-policy"].startswith("default-src 'self'")
-    [record] = [one for one in caplog.records if one.exc_info]
+    answer = client.get("/probe/broken", headers={"X-Request-ID": "mine-1"})
+    assert answer.status_code == 500
+    assert "secret words" not in answer.text
+    assert "Traceback" not in answer.text
+    assert answer.headers["x-request-id"] == "mine-1"
+    assert answer.headers["content-security-policy"].startswith("default-src 'self'")
+    [record] = [logged for logged in caplog.records if logged.exc_info]
     line = json.loads(JsonFormatter().format(record))
     assert "secret words" in line["exception"]
     monkeypatch.setattr(home, "render", lambda *_: 1 / 0)
@@ -390,7 +393,9 @@ def test_metrics_count_by_template_and_say_what_there_is(make):
     at.get("/probe/a/read")
     at.get("/probe/b/read")
     at.get("/made-up/17")
-    families = {one.name: one for one in text_string_to_metric_families(at.get("/metrics").text)}
+    families = {
+        family.name: family for family in text_string_to_metric_families(at.get("/metrics").text)
+    }
     counted = {
         (sample.labels["route"], sample.labels["status"]): sample.value
         for sample in families["starcat_requests"].samples
@@ -411,17 +416,19 @@ def test_ready_says_what_is_wrong(make, monkeypatch):
     monkeypatch.setattr(type(app.state.slots), "is_alive", False)
     assert "a slot of jobs has ended" in " ".join(at.get("/readyz").json()["reasons"])
     monkeypatch.setattr(type(app.state.slots), "is_alive", True)
-    found = at.get("/readyz")
-    assert (found.status_code, found.json()) == (200, {"ready": True, "reasons": []})
+    answer = at.get("/readyz")
+    assert (answer.status_code, answer.json()) == (200, {"ready": True, "reasons": []})
     monkeypatch.setattr("starcat_service.security.request_limits.free_gib", lambda folder: 0.2)
-    found = at.get("/readyz")
-    assert found.status_code == 503
-    assert "0.20 GiB free, and 1 have to be left" in found.json()["reasons"][0]
+    answer = at.get("/readyz")
+    assert answer.status_code == 503
+    assert "0.20 GiB free, and 1 have to be left" in answer.json()["reasons"][0]
     monkeypatch.setattr("starcat_service.records.WAIT_S", 0.05)
     other = sqlite3.connect(app.state.service.paths.records)
     other.execute("BEGIN IMMEDIATE")
     app.state.service.records.close()
-    assert any("records cannot be written" in one for one in at.get("/readyz").json()["reasons"])
+    assert any(
+        "records cannot be written" in reason for reason in at.get("/readyz").json()["reasons"]
+    )
     other.close()
 
 

@@ -73,9 +73,9 @@ def as_form(name: str, target: str, status: Status, **fields: str) -> Hostile:
 def as_files(
     name: str, target: str, status: Status, files: dict[str, tuple[str, bytes]], **fields: str
 ) -> Hostile:
-    made = requests.Request("POST", "http://localhost", data=fields, files=files).prepare()
-    kind = {"Content-Type": str(made.headers.get("Content-Type", ""))}
-    return Hostile(name, "POST", target, status, kind, made.body or b"")
+    prepared = requests.Request("POST", "http://localhost", data=fields, files=files).prepare()
+    kind = {"Content-Type": str(prepared.headers.get("Content-Type", ""))}
+    return Hostile(name, "POST", target, status, kind, prepared.body or b"")
 
 
 def huge_png() -> bytes:
@@ -178,9 +178,9 @@ class Target:
     token: str
     around: Path
 
-    def send(self, one: Hostile) -> Answer:
-        headers = {"Authorization": f"Bearer {self.token}"} | one.headers
-        return self.served.raw(one.method, one.target, headers, one.body)
+    def send(self, hostile: Hostile) -> Answer:
+        headers = {"Authorization": f"Bearer {self.token}"} | hostile.headers
+        return self.served.raw(hostile.method, hostile.target, headers, hostile.body)
 
     def logged(self) -> list[dict[str, Any]]:
         """Return the requests in the log of the server."""
@@ -190,14 +190,14 @@ class Target:
     def files(self) -> dict[str, bytes | None]:
         """What must not change: everything around the root, and what lasts in it."""
         root = self.served.root
-        found: dict[str, bytes | None] = {}
+        contents: dict[str, bytes | None] = {}
         for path in sorted(self.around.rglob("*")):
             within = path.relative_to(root).parts[:1] if path.is_relative_to(root) else ()
             if within and within[0] not in ("databases", "registry", "catalogs", "service.toml"):
                 continue
             if path != self.served.log:
-                found[str(path)] = path.read_bytes() if path.is_file() else None
-        return found
+                contents[str(path)] = path.read_bytes() if path.is_file() else None
+        return contents
 
 
 @pytest.fixture(scope="module")
@@ -214,15 +214,15 @@ def target(tmp_path_factory: pytest.TempPathFactory, small_database: Path) -> It
         yield Target(served, token, around)
 
 
-@pytest.mark.parametrize("one", EVERY, ids=[one.name for one in EVERY])
-def test_a_hostile_request_is_refused(one, target):
+@pytest.mark.parametrize("hostile", EVERY, ids=[hostile.name for hostile in EVERY])
+def test_a_hostile_request_is_refused(hostile, target):
     before = target.files()
     begun_s = time.monotonic()
-    answer = target.send(one)
-    assert answer.status in one.statuses, answer.text[:500]
+    answer = target.send(hostile)
+    assert answer.status in hostile.statuses, answer.text[:500]
     assert time.monotonic() - begun_s < 15.0
-    for told in ("Traceback", 'File "', str(target.around), "site-packages", "root:x:0"):
-        assert told not in answer.text, answer.text[:500]
+    for secret in ("Traceback", 'File "', str(target.around), "site-packages", "root:x:0"):
+        assert secret not in answer.text, answer.text[:500]
     assert "what nobody is to see" not in answer.text
     if "html" in answer.headers.get("content-type", ""):
         assert SCRIPT not in answer.text
@@ -242,13 +242,13 @@ def talk(served: Served, *parts: bytes, wait_s: float = 0.0) -> bytes:
                 time.sleep(wait_s)
         except OSError:
             pass  # it was refused on the way
-        found = b""
+        received = b""
         try:
             while more := line.recv(65_536):
-                found += more
+                received += more
         except ConnectionResetError:
             pass
-        return found
+        return received
 
 
 PART = b'--edge\r\nContent-Disposition: form-data; name="file"; filename="f.png"\r\n\r\n'
@@ -260,8 +260,8 @@ def test_a_slow_upload_is_ended(target):
         "\r\nContent-Type: multipart/form-data; boundary=edge\r\nContent-Length: 1000\r\n\r\n"
     )
     begun_s = time.monotonic()
-    found = talk(target.served, head.encode() + PART, *[b"x"] * 8, wait_s=0.25)
-    assert found.startswith(b"HTTP/1.1 408 ")
+    received = talk(target.served, head.encode() + PART, *[b"x"] * 8, wait_s=0.25)
+    assert received.startswith(b"HTTP/1.1 408 ")
     assert time.monotonic() - begun_s < 10.0
 
 
@@ -269,8 +269,8 @@ def test_a_slow_upload_is_ended(target):
 @pytest.mark.parametrize("first", [b"", b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX-A: "])
 def test_a_head_without_an_end_is_ended(target, first):
     begun_s = time.monotonic()
-    found = talk(target.served, first, *[b"x"] * 12 if first else [], wait_s=1.0)
-    assert found == b""
+    received = talk(target.served, first, *[b"x"] * 12 if first else [], wait_s=1.0)
+    assert received == b""
     assert 10.0 < time.monotonic() - begun_s < 19.0
 
 
@@ -280,32 +280,32 @@ FOLDED = [ID + b"\r\n b: c", ID + b"\x00b", ID + b"\x0bb", b"Host : 127.0.0.1", 
 
 @pytest.mark.parametrize("header", FOLDED)
 def test_headers_that_hold_others_are_refused(target, header):
-    found = talk(
+    received = talk(
         target.served, b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n" + header +
         b"\r\nConnection: close\r\n\r\n",
     )  # fmt: skip
-    status = int(found.split()[1])
+    status = int(received.split()[1])
     assert status in (200, 400)
-    assert b"\r\n b: c" not in found
+    assert b"\r\n b: c" not in received
     if status == 200:
-        head = found.split(b"\r\n\r\n")[0].lower()
+        head = received.split(b"\r\n\r\n")[0].lower()
         [name] = [line for line in head.split(b"\r\n") if line.startswith(b"x-request-id")]
         assert len(name) == len(b"x-request-id: ") + 16  # the service chose another id
 
 
 def test_the_answers_hold_no_header_of_a_request(target):
-    found = target.send(get("next", "/sign-in?next=%0d%0aSet-Cookie:%20a=b", (200,)))
-    assert "set-cookie" not in found.headers
-    assert "Set-Cookie" not in found.text
+    answer = target.send(get("next", "/sign-in?next=%0d%0aSet-Cookie:%20a=b", (200,)))
+    assert "set-cookie" not in answer.headers
+    assert "Set-Cookie" not in answer.text
 
 
 def test_a_script_in_a_description_is_text_on_every_page(target, small_spec, sao_lines, tmp_path):
     (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
     content = tomllib.loads(small_spec)
     content |= {"description": f'{SCRIPT}"onload=alert(1)', "name": "scripted"}
-    made = build(spec_from_dict(content, "spec"), tmp_path, inputs={"sao": [tmp_path / "sao.dat"]})
+    built = build(spec_from_dict(content, "spec"), tmp_path, inputs={"sao": [tmp_path / "sao.dat"]})
     other = "f" * 16
-    add_database(target.served.root, made.folder, other)
+    add_database(target.served.root, built.folder, other)
     for path in ("/", "/databases", f"/databases/{other}", f"/identify?database={other}"):
         page = target.send(get(path, path, 200))
         assert page.status == 200, page.text[:500]
@@ -365,15 +365,17 @@ def by_chance(number: int) -> list[Hostile]:
 @pytest.mark.timeout(1500)
 @pytest.mark.parametrize("many", [8, pytest.param(1_000, marks=pytest.mark.slow)])
 def test_no_query_by_chance_is_a_defect(target, many):
-    sent = [one for number in range(many) for one in by_chance(number)]
-    statuses = [target.send(one).status for one in sent]
+    sent = [hostile for number in range(many) for hostile in by_chance(number)]
+    statuses = [target.send(hostile).status for hostile in sent]
     wrong = [
-        (one.target, one.body) for one, found in zip(sent, statuses, strict=True) if found > 499
+        (hostile.target, hostile.body)
+        for hostile, status in zip(sent, statuses, strict=True)
+        if status > 499
     ]
     assert wrong == []
     assert {200, 400} <= set(statuses)
     assert target.send(get("", "/readyz", 200)).status == 200
-    assert [one for one in target.logged() if one["level"] == "error"] == []
+    assert [line for line in target.logged() if line["level"] == "error"] == []
 
 
 # Requests by the schema: schemathesis runs as a command of its own, since its plugin for pytest

@@ -76,10 +76,10 @@ def service(opened: Open) -> Service:
 
 
 def begin(service: Service, job: Job) -> Attempt:
-    found = begin_next(service.records, (job.kind,))
-    assert found is not None
-    assert found.id == job.id
-    return Attempt(service.records, found)
+    begun = begin_next(service.records, (job.kind,))
+    assert begun is not None
+    assert begun.id == job.id
+    return Attempt(service.records, begun)
 
 
 def end(service: Service, job: Job, how: str) -> None:
@@ -105,11 +105,11 @@ def test_each_job_is_begun_once_and_the_first_first(service, spec):
         thread.start()
     for thread in threads:
         thread.join()
-    found = [one for one in begun if one is not None]
-    assert {one.id for one in found} == {one.id for one in (job, *others)}
-    assert {(one.state, one.attempt) for one in found} == {("running", 1)}
-    assert min(found, key=lambda one: one.started_s).id == job.id
-    assert len(found) == 4
+    jobs = [begun_job for begun_job in begun if begun_job is not None]
+    assert {begun_job.id for begun_job in jobs} == {begun_job.id for begun_job in (job, *others)}
+    assert {(begun_job.state, begun_job.attempt) for begun_job in jobs} == {("running", 1)}
+    assert min(jobs, key=lambda begun_job: begun_job.started_s).id == job.id
+    assert len(jobs) == 4
     assert states(service, job) == ["queued", "running"]
     again = submit_build(service, spec, "bob")
     assert (again.is_new, again.job.id) == (False, job.id)
@@ -137,7 +137,7 @@ def test_a_key_is_of_what_the_result_depends_on(service, spec, archive, small_sp
     key = build_key(service.records, spec)
     written = spec_from_dict(tomllib.loads(spec_toml(spec)), "all keys")
     recorded = spec_from_dict(json.loads(json.dumps(spec.recorded())), "recorded")
-    assert {build_key(service.records, one) for one in (spec, written, recorded)} == {key}
+    assert {build_key(service.records, same) for same in (spec, written, recorded)} == {key}
     others = ('version = "1.0.1"', "epoch_jyear = 2026.5", 'name = "smaller"')
     for text in others:
         name = text.split()[0]
@@ -209,8 +209,8 @@ def test_a_full_disk_takes_no_job(opened, spec):
     service = opened()
     job = submit_build(service, spec, "anne").job
     JobSlots(opened(free_gib=1e9)).run_next()
-    found = service.jobs.get(job.id)
-    assert (found.state, found.error["status"]) == ("failed", 507)
+    ended = service.jobs.get(job.id)
+    assert (ended.state, ended.error["status"]) == ("failed", 507)
 
 
 def test_a_user_has_so_much_of_the_disk(opened, spec, small_database):
@@ -266,14 +266,14 @@ def test_of_each_stage_the_last_event_is_kept(service, spec):
     attempt.report_stage("self-test", 0, None)
     attempt.report_stage("self-test", 1, None)
     events = service.jobs.events(attempt.job.id)
-    told = [(event.number, event.kind, event.data.get("done")) for event in events]
-    assert told == [
+    kept = [(event.number, event.kind, event.data.get("done")) for event in events]
+    assert kept == [
         (1, "state", None), (2, "state", None), (52, "stage", 49), (53, "log", None),
         (55, "stage", 1),
     ]  # fmt: skip
     assert service.jobs.events(attempt.job.id, after=53) == events[-1:]
-    found = service.jobs.get(attempt.job.id)
-    assert (found.stage, found.done, found.total) == ("self-test", 1, None)
+    current = service.jobs.get(attempt.job.id)
+    assert (current.stage, current.done, current.total) == ("self-test", 1, None)
 
 
 def test_a_log_has_an_end(service, spec, monkeypatch):
@@ -291,9 +291,9 @@ def test_a_job_that_loses_its_server_waits_again_but_not_for_ever(service, spec)
         begun = begin(service, job).job
         assert begun.attempt == attempt
         interrupt(service.records, begun)
-    found = service.jobs.get(job.id)
-    assert found.state == "failed"
-    assert "the service ended 8 times while this job ran" in found.error["detail"]
+    ended = service.jobs.get(job.id)
+    assert ended.state == "failed"
+    assert "the service ended 8 times while this job ran" in ended.error["detail"]
     retry_job(service, job.id, ANNE)
     interrupt(service.records, begin(service, job).job)
     assert service.jobs.get(job.id).state == "queued"
@@ -377,8 +377,8 @@ def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
         assert (answer.status_code, job["state"] in ("queued", "running")) == (201, True)
         assert answer.headers["location"] == f"{JOBS}/{job['id']}"
         events = sent_events(client.get(f"{JOBS}/{job['id']}/events").text)
-        told = [data["state"] for kind, _, data in events if kind == "state"]
-        assert told == ["queued", "running", "done"]
+        states_seen = [data["state"] for kind, _, data in events if kind == "state"]
+        assert states_seen == ["queued", "running", "done"]
         stages = [data["stage"] for kind, _, data in events if kind == "stage"]
         assert "self-test" in stages
         assert "verify" in stages
@@ -395,14 +395,16 @@ def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
         wish = {"kind": "evaluate", "database": database, "frames": 2, "seed": 1}
         measured = client.post(JOBS, json=wish).json()["id"]
         client.get(f"{JOBS}/{measured}/events")
-        found = client.get(f"{JOBS}/{measured}").json()["result"]
-        assert [rate["frames"] for rate in found["rates"]] == [2, 2, 2, 2]
-        assert [curve["quantity"] for curve in found["curves"]] == list(QUANTITIES)
+        evaluation = client.get(f"{JOBS}/{measured}").json()["result"]
+        assert [rate["frames"] for rate in evaluation["rates"]] == [2, 2, 2, 2]
+        assert [curve["quantity"] for curve in evaluation["curves"]] == list(QUANTITIES)
         page = client.get(f"/jobs/{measured}").text
-        headline = f"{100 * found['rates'][0]['identified_share']:.1f}"
+        headline = f"{100 * evaluation['rates'][0]['identified_share']:.1f}"
         assert f'id="headline">{headline}<' in page
         assert page.count('<figure class="chart">') == 3
-        assert page.count('class="point"') == sum(len(curve["points"]) for curve in found["curves"])
+        assert page.count('class="point"') == sum(
+            len(curve["points"]) for curve in evaluation["curves"]
+        )
         listed = client.get(JOBS, params={"kind": "evaluate", "limit": 1}).json()
         assert (listed["total"], listed["jobs"][0]["id"]) == (1, measured)
         service = client.app.state.service
@@ -414,12 +416,12 @@ def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
 
 def sent_events(text: str) -> list[tuple[str, int, dict[str, Any]]]:
     """Return kind, number and data of server-sent events."""
-    found = []
+    events = []
     for block in text.strip().split("\n\n"):
         fields = dict(line.split(": ", 1) for line in block.splitlines() if line[0] != ":")
         if fields:
-            found.append((fields["event"], int(fields["id"]), json.loads(fields["data"])))
-    return found
+            events.append((fields["event"], int(fields["id"]), json.loads(fields["data"])))
+    return events
 
 
 LONG = {"self_test": {"frames": 100_000, "min_identified": 0.0}}

@@ -84,7 +84,7 @@ class Service:
 
     def processes(self) -> list[int]:
         """Return the processes that were started for this root and still live."""
-        found = []
+        numbers = []
         for folder in Path("/proc").glob("[0-9]*"):
             try:
                 is_of_root = (
@@ -94,8 +94,8 @@ class Service:
             except OSError:
                 continue
             if is_of_root and not is_dead and int(folder.name) != os.getpid():
-                found.append(int(folder.name))
-        return found
+                numbers.append(int(folder.name))
+        return numbers
 
 
 @pytest.fixture
@@ -117,11 +117,11 @@ def service(tmp_path: Path, sao_lines: list[bytes]) -> Iterator[Service]:
 def test_five_kills_lose_nothing_and_double_nothing(service, small_spec):
     generator = random.Random(15)
     service.start()
-    made = []
+    ids = []
     for number in range(BUILDS):
         version = small_spec.replace('"1.0.0"', f'"1.0.{number}"')
         spec = version.replace("frames = 5", "frames = 400")
-        made.append(service.post(kind="build", spec=spec)["id"])
+        ids.append(service.post(kind="build", spec=spec)["id"])
     for _ in range(KILLS):
         time.sleep(generator.uniform(0.2, 5.0))
         assert service.end(signal.SIGKILL) == -signal.SIGKILL
@@ -129,7 +129,7 @@ def test_five_kills_lose_nothing_and_double_nothing(service, small_spec):
         until(lambda: not service.processes(), 10.0)
         assert_all_whole(service.root)
         service.start()
-        assert set(service.jobs()) == set(made)
+        assert set(service.jobs()) == set(ids)
     until(lambda: all(job["state"] == "done" for job in service.jobs().values()), 200.0)
     for job_id, job in service.jobs().items():
         states = service.states(job_id)
@@ -218,17 +218,17 @@ def test_the_records_are_whole_after_each_kill(service, small_spec):
     """Submissions that were answered are remembered, wherever the kill falls."""
     generator = random.Random(3)
     service.start()
-    known: list[str] = []
+    ids: list[str] = []
     for _ in range(3):
         until_s = time.monotonic() + generator.uniform(0.1, 0.6)
         while time.monotonic() < until_s:
-            limit = round(2.0 + 0.01 * len(known), 2)
+            limit = round(2.0 + 0.01 * len(ids), 2)
             wish = {"kind": "ingest", "source": "sao", "read_limit_mag": limit}
             answer = requests.post(service.address, json=wish, timeout=20)
             if answer.status_code == 429:
                 break
-            known.append(json.loads(answer.content)["id"])
+            ids.append(json.loads(answer.content)["id"])
         service.end(signal.SIGKILL)
         until(lambda: not service.processes(), 10.0)
         service.start()
-        assert set(service.jobs()) == set(known)
+        assert set(service.jobs()) == set(ids)

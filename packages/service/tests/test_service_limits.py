@@ -51,8 +51,8 @@ WIDE = "SELECT repeat('x', 1000) AS v, range AS n FROM range({})"
 
 
 def asked(client: TestClient, query: str, **more: object) -> tuple[int, dict[str, object]]:
-    given = {"targets": [DATABASE], "query": query, "max_rows": 100_000, **more}
-    answer = client.post("/api/v1/sql", json=given)
+    question = {"targets": [DATABASE], "query": query, "max_rows": 100_000, **more}
+    answer = client.post("/api/v1/sql", json=question)
     return answer.status_code, answer.json()
 
 
@@ -67,8 +67,8 @@ def test_rows_are_limited_in_bytes_and_files_are_not(client):
         assert (status, problem["key"]) == (413, "max_rows")
         assert "more than 1 MiB (rows_mib); ask for fewer rows" in str(problem["detail"])
         assert "for a file (format: csv, json, parquet" in str(problem["detail"])
-    given = {"targets": [DATABASE], "query": WIDE.format(2_000), "format": "csv"}
-    answer = client.post("/api/v1/sql", json=given)
+    question = {"targets": [DATABASE], "query": WIDE.format(2_000), "format": "csv"}
+    answer = client.post("/api/v1/sql", json=question)
     assert (answer.status_code, answer.headers["x-starcat-rows"]) == (200, "2000")
     assert len(answer.content) > 2_000_000
 
@@ -81,8 +81,8 @@ def reported(error: Exception) -> tuple[str, bytes]:
 def test_a_format_that_needs_the_table_in_memory_says_which_do_not(client, monkeypatch):
     sandbox = client.app.state.service.sandbox
     monkeypatch.setattr(sandbox, "_answer", lambda worker, request: reported(MemoryError()))
-    given = {"targets": [DATABASE], "query": "SELECT 1", "format": "ecsv"}
-    answer = client.post("/api/v1/sql", json=given)
+    question = {"targets": [DATABASE], "query": "SELECT 1", "format": "ecsv"}
+    answer = client.post("/api/v1/sql", json=question)
     assert answer.status_code == 413
     assert answer.json()["detail"] == (
         "the table takes more memory as ECSV than a request may (1 GiB); choose csv, json, "
@@ -137,19 +137,19 @@ def test_what_a_killed_process_left_is_removed_by_the_next_session(small_databas
     run = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
     assert run.stdout is not None
     run.stdout.readline()
-    [left] = within.iterdir()
+    [abandoned] = within.iterdir()
     long_ago = time.time() - 2 * ABANDONED_S
     other, link = within / "other", within / f"{SCRATCH_PREFIX}link"
     other.mkdir()
     link.symlink_to(other)
-    os.utime(left, (long_ago, long_ago))
+    os.utime(abandoned, (long_ago, long_ago))
     with open_session([str(small_database)], within=within):
-        assert left.exists(), "its process lives"
+        assert abandoned.exists(), "its process lives"
     run.kill()
     run.wait()
     run.stdout.close()
     with open_session([str(small_database)], within=within):
-        assert not left.exists()
+        assert not abandoned.exists()
     assert sorted(within.iterdir()) == [other, link]
 
 
@@ -162,8 +162,8 @@ def test_a_flight_image_on_a_full_disk_is_reported_as_such(client, monkeypatch):
     error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
     sandbox, reply = client.app.state.service.sandbox, reported(error)
     monkeypatch.setattr(sandbox, "_answer", lambda worker, request: reply)
-    found = client.get(f"/databases/{DATABASE}/image")
-    assert found.status_code == 507
+    answer = client.get(f"/databases/{DATABASE}/image")
+    assert answer.status_code == 507
 
 
 def test_a_publication_that_fails_leaves_no_part(small_database, tmp_path, monkeypatch):
@@ -182,8 +182,10 @@ def test_a_publication_that_fails_leaves_no_part(small_database, tmp_path, monke
 
 def test_a_query_job_without_a_token_is_seen_by_its_client_only(client):
     other = TestClient(client.app, base_url=LOCAL, client=("192.0.2.7", 4711))
-    made = client.post("/tap/async", data={"QUERY": "SELECT 1 FROM stars"}, follow_redirects=False)
-    job = made.headers["location"].removeprefix(LOCAL)
+    answer = client.post(
+        "/tap/async", data={"QUERY": "SELECT 1 FROM stars"}, follow_redirects=False
+    )
+    job = answer.headers["location"].removeprefix(LOCAL)
     assert job.removeprefix("/tap/async/") in client.get("/tap/async").text
     assert job.removeprefix("/tap/async/") not in other.get("/tap/async").text
     for path in ("", "/phase", "/parameters", "/owner", "/results", "/error"):
@@ -270,15 +272,15 @@ def test_estimates_of_the_child_process_are_the_same():
     spec = preset("gaia-12deg", {"selection.faint_limit_mag": "4.5"})
     catalogs, remote = Catalogs(), ChildCatalogs(wait_s=100.0)
     try:
-        expected, found = catalogs.estimate(spec), asyncio.run(remote.estimate(spec))
-        assert found.fields.count.tolist() == expected.fields.count.tolist()
-        assert (found.fields.boresights == expected.fields.boresights).all()
+        expected, estimate = catalogs.estimate(spec), asyncio.run(remote.estimate(spec))
+        assert estimate.fields.count.tolist() == expected.fields.count.tolist()
+        assert (estimate.fields.boresights == expected.fields.boresights).all()
         for name in ("spec", "cost", "filters", "rejected", "refusals", "warnings", "files"):
-            assert getattr(found, name) == getattr(expected, name)
-        assert found.coverage.stars == expected.coverage.stars
+            assert getattr(estimate, name) == getattr(expected, name)
+        assert estimate.coverage.stars == expected.coverage.stars
         assert asyncio.run(remote.enough_limit(spec)) == catalogs.enough_limit(spec)
-        own = asyncio.run(remote.starter("own", spec.camera))
-        assert own == catalogs.starter("own", spec.camera)
+        starter = asyncio.run(remote.starter("own", spec.camera))
+        assert starter == catalogs.starter("own", spec.camera)
         assert remote.catalogs_read() == catalogs.catalogs_read()
         # If the process ends, the next request starts a new process.
         child = remote._worker
@@ -296,9 +298,9 @@ def test_a_request_that_waits_for_a_process_that_ends_gets_an_error(monkeypatch)
     remote = ChildCatalogs()
     spec = preset("gaia-12deg", {"selection.faint_limit_mag": "4.5"})
     threading.Timer(1.0, lambda: os.kill(remote._worker.pid, signal.SIGKILL)).start()
-    with pytest.raises(Problem, match="ended, as it does without memory") as told:
+    with pytest.raises(Problem, match="ended, as it does without memory") as caught:
         asyncio.run(remote.estimate(spec))
-    assert told.value.status == 503
+    assert caught.value.status == 503
     remote.close()
 
 
@@ -315,19 +317,19 @@ ARCHIVE = f"/api/v1/databases/{DATABASE}/archive"
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 48 MiB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=48m", "tmpfs", str(place)]
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=48m", "tmpfs", str(folder)]
     if sys.platform != "linux" or subprocess.run(command, capture_output=True).returncode:
         pytest.skip("a disk can be mounted by root of Linux only")
-    yield place
-    subprocess.run(["umount", "-l", str(place)], check=True)
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def fill(place: Path) -> None:
-    left = shutil.disk_usage(place).free
-    with (place / "filler").open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, left)
+def fill(folder: Path) -> None:
+    free_bytes = shutil.disk_usage(folder).free
+    with (folder / "filler").open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, free_bytes)
 
 
 def picture_of(image: Any) -> bytes:
@@ -345,9 +347,11 @@ def test_a_full_disk_is_reported_whatever_is_to_be_left_free(small_disk, small_d
     with client_of(root, free_gib=0.0, anonymous="publisher") as client:
         assert client.get("/readyz").status_code == 200
         fill(small_disk)
-        found = client.get("/readyz")
-        assert found.status_code == 503
-        assert any("GiB free" in one or "is full" in one for one in found.json()["reasons"])
+        ready = client.get("/readyz")
+        assert ready.status_code == 503
+        assert any(
+            "GiB free" in reason or "is full" in reason for reason in ready.json()["reasons"]
+        )
         file = {"file": ("frame.png", picture_of(BLACK))}
         csv = {**QUESTION, "format": "csv"}
         for answer in (
@@ -374,11 +378,11 @@ OUTAGES = [
 
 @pytest.mark.parametrize(("error", "status"), OUTAGES)
 def test_what_is_no_defect_of_starcat_has_a_status_of_its_own(tmp_path, error, status):
-    found = outage_of(error, tmp_path)
-    assert (found.status if found else None) == status
+    outage = outage_of(error, tmp_path)
+    assert (outage.status if outage else None) == status
     wrapped = OutputError("cannot be written", path=tmp_path)
     wrapped.__cause__ = error
-    assert (found := outage_of(wrapped, tmp_path)) is None or found.status == status
+    assert (outage := outage_of(wrapped, tmp_path)) is None or outage.status == status
 
 
 # Records.
@@ -386,9 +390,11 @@ def test_what_is_no_defect_of_starcat_has_a_status_of_its_own(tmp_path, error, s
 
 def test_damaged_records_are_named_with_the_backup_at_the_start(tmp_path):
     (tmp_path / "records.sqlite").write_bytes(b"no database at all" * 1000)
-    with pytest.raises(ProductError, match=r"records.sqlite cannot be used .*last backup") as told:
+    with pytest.raises(
+        ProductError, match=r"records.sqlite cannot be used .*last backup"
+    ) as caught:
         Records(tmp_path / "records.sqlite")
-    assert str(tmp_path / "records.sqlite") in str(told.value)
+    assert str(tmp_path / "records.sqlite") in str(caught.value)
 
 
 @pytest.mark.slow
@@ -400,10 +406,10 @@ def test_damaged_records_are_reported_while_the_service_runs(own_root):
         other.close()
         size = (own_root / "records.sqlite").stat().st_size
         (own_root / "records.sqlite").write_bytes(b"x" * size)
-        found = client.get("/readyz")
-        assert found.status_code == 503
-        assert "records.sqlite cannot be used" in found.text
-        assert "backup" in found.text
+        ready = client.get("/readyz")
+        assert ready.status_code == 503
+        assert "records.sqlite cannot be used" in ready.text
+        assert "backup" in ready.text
         for path in ("/api/v1/jobs", "/tap/async", "/jobs"):
             answer = client.get(path)
             assert answer.status_code == 503, path
@@ -417,9 +423,9 @@ def test_a_root_that_is_gone_is_reported(own_root):
     with client_of(own_root, anonymous="publisher") as client:
         assert client.get("/readyz").status_code == 200
         shutil.move(own_root, own_root.with_name("elsewhere"))
-        found = client.get("/readyz")
-        assert found.status_code == 503
-        assert "the folder of the service is gone" in found.text
+        ready = client.get("/readyz")
+        assert ready.status_code == 503
+        assert "the folder of the service is gone" in ready.text
         file = {"file": ("frame.png", picture_of(BLACK))}
         answers = [
             client.post(IDENTIFY, files=file),
@@ -428,7 +434,7 @@ def test_a_root_that_is_gone_is_reported(own_root):
             client.get("/tap/tables"),
             client.get("/api/v1/databases"),
         ]
-        assert 500 not in [one.status_code for one in answers]
+        assert 500 not in [answer.status_code for answer in answers]
         shutil.move(own_root.with_name("elsewhere"), own_root)
         assert client.get("/readyz").status_code == 200
 
@@ -452,8 +458,10 @@ def test_an_interrupted_upload_is_no_defect(own_root, tmp_path):
                     time.sleep(0.1)
         assert served.raw("GET", "/healthz").status == 200
         time.sleep(0.3)
-        lines = [json.loads(one) for one in served.log.read_text().splitlines() if one[:1] == "{"]
-    assert [one for one in lines if one["level"] == "error"] == []
+        lines = [
+            json.loads(line) for line in served.log.read_text().splitlines() if line[:1] == "{"
+        ]
+    assert [line for line in lines if line["level"] == "error"] == []
 
 
 def two_spots(*sigmas: float) -> Any:
@@ -468,8 +476,8 @@ def two_spots(*sigmas: float) -> Any:
 def test_spots_of_different_widths_have_a_width(sigmas):
     levels = subtract_background(two_spots(*sigmas).astype(np.float64))
     places = np.array([(80.5 + 150 * k, 90.5) for k in range(len(sigmas))])
-    found = sigma_of_stars(levels, places, np.arange(9.0, 0.0, -1.0)[: len(places)])
-    assert 0.5 < found < 5.0
+    sigma_px = sigma_of_stars(levels, places, np.arange(9.0, 0.0, -1.0)[: len(places)])
+    assert 0.5 < sigma_px < 5.0
 
 
 # Archives.
@@ -484,12 +492,12 @@ def test_an_archive_follows_no_link_and_has_what_the_manifest_says(own_root, tmp
         content = stars.read_bytes()
         stars.unlink()
         stars.symlink_to(secret)
-        found = client.get(ARCHIVE)
-        assert (found.status_code, "stars.parquet" in found.text) == (404, True)
+        answer = client.get(ARCHIVE)
+        assert (answer.status_code, "stars.parquet" in answer.text) == (404, True)
         stars.unlink()
         stars.write_bytes(content[:-1])
-        found = client.get(ARCHIVE)
-        assert (found.status_code, "the manifest says" in found.text) == (422, True)
+        answer = client.get(ARCHIVE)
+        assert (answer.status_code, "the manifest says" in answer.text) == (422, True)
         stars.unlink()
         assert client.get(ARCHIVE).status_code == 404
 
@@ -524,4 +532,4 @@ def test_a_worker_whose_disk_is_full_reports_it_and_goes_on(tmp_path, archive, s
     assert (ran.returncode, ran.stderr) == (0, "")
     lines = ran.stdout.splitlines()
     assert len(lines) == 2
-    assert all("writing failed (File too large); nothing was left there" in one for one in lines)
+    assert all("writing failed (File too large); nothing was left there" in line for line in lines)

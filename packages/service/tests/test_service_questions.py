@@ -79,12 +79,12 @@ def test_whole_numbers_that_readers_round_are_texts(client):
 
 
 def test_gallery_macros_and_views_are_listed(client, small_database):
-    assert "densest-fields" in [one["name"] for one in client.get(f"{SQL}/queries").json()]
-    assert "cone" in [one["name"] for one in client.get(f"{SQL}/macros").json()]
+    assert "densest-fields" in [query["name"] for query in client.get(f"{SQL}/queries").json()]
+    assert "cone" in [macro["name"] for macro in client.get(f"{SQL}/macros").json()]
     views = client.get(f"{SQL}/views", params={"target": DATABASE}).json()
     manifest = json.loads((small_database / "manifest.json").read_bytes())
-    assert {one["view"] for one in views} == set(manifest["products"])
-    assert all(column["description"] for one in views for column in one["columns"])
+    assert {view["view"] for view in views} == set(manifest["products"])
+    assert all(column["description"] for view in views for column in view["columns"])
 
 
 def test_nothing_is_left_in_scratch(client, shared_root):
@@ -93,10 +93,10 @@ def test_nothing_is_left_in_scratch(client, shared_root):
     client.post(IDENTIFY, json={"centroids_px": []})
     # Sessions that are kept for the next query have a folder each.
     kept = ("matplotlib", "tap-", SCRATCH_PREFIX)
-    left = [
-        one.name for one in (shared_root / "scratch").iterdir() if not one.name.startswith(kept)
+    names = [
+        path.name for path in (shared_root / "scratch").iterdir() if not path.name.startswith(kept)
     ]
-    assert left == []
+    assert names == []
 
 
 @pytest.fixture(scope="module")
@@ -107,10 +107,10 @@ def frame(tmp_path_factory: pytest.TempPathFactory, small_database: Path) -> Pat
 
     database = open_database(small_database)
     eye, folder = database.camera, tmp_path_factory.mktemp("frames")
-    given = simulate_frames(database.directions, eye, 1, Noise(0.2), 3, mag=database.mag)
-    one = next(given)
+    frames = simulate_frames(database.directions, eye, 1, Noise(0.2), 3, mag=database.mag)
+    simulated = next(frames)
     for suffix in (".csv", ".png"):
-        write_simulated(folder / f"frame{suffix}", one, eye, 3)
+        write_simulated(folder / f"frame{suffix}", simulated, eye, 3)
     return folder / "frame.csv"
 
 
@@ -120,26 +120,26 @@ def test_an_upload_is_answered_as_by_the_command(client, starcat, small_database
     with path.open("rb") as file:
         answer = client.post(IDENTIFY, files={"file": (path.name, file)})
     assert answer.status_code == 200, answer.text
-    found = answer.json()
+    answer = answer.json()
     ran = starcat(["identify", small_database, path, "--json"])
-    [mine], [theirs] = found["frames"], json.loads(ran.out)
+    [mine], [theirs] = answer["frames"], json.loads(ran.out)
     differing = {key: (value, theirs[key]) for key, value in mine.items() if value != theirs[key]}
     assert differing.keys() <= {"time_s"}, differing
-    assert found["frames"][0]["status"] == "identified"
-    assert found["database"] == "small-1.0.0"
+    assert answer["frames"][0]["status"] == "identified"
+    assert answer["database"] == "small-1.0.0"
 
 
 def test_centroids_are_answered_with_options(client, frame):
     rows = np.loadtxt(frame, delimiter=",", skiprows=1)
     asked = {"centroids_px": rows[:, :2].tolist(), "mag": rows[:, 2].tolist(), "name": "mine"}
-    [one] = client.post(IDENTIFY, json=asked).json()["frames"]
-    assert (one["status"], one["frame"]) == ("identified", "mine")
-    assert len(one["q_body_from_icrs"]) == 4
-    assert any(star["star"] for star in one["stars"])
+    [result] = client.post(IDENTIFY, json=asked).json()["frames"]
+    assert (result["status"], result["frame"]) == ("identified", "mine")
+    assert len(result["q_body_from_icrs"]) == 4
+    assert any(star["star"] for star in result["stars"])
     asked["options"] = {"method": "pyramid", "tolerance_px": 1.0, "max_steps": 1}
-    [one] = client.post(IDENTIFY, json=asked).json()["frames"]
-    assert one["status"] != "identified"
-    assert one["refusal"]["message"]
+    [result] = client.post(IDENTIFY, json=asked).json()["frames"]
+    assert result["status"] != "identified"
+    assert result["refusal"]["message"]
 
 
 @pytest.mark.parametrize("kind", ["png", "svg"])

@@ -72,23 +72,23 @@ def test_the_keys_are_described(client):
 
 def test_presets_are_listed_and_explained(client):
     listed = client.get(f"{API}/specs/presets").json()["presets"]
-    assert tuple(one["name"] for one in listed) == preset_names()
-    one = client.get(f"{API}/specs/presets/sao-12deg").json()
-    assert one["sources"] == ["sao", "hipparcos"]
-    assert spec_from_dict(content_of_toml(one["toml"], "text"), "text") == preset("sao-12deg")
-    assert spec_from_dict(one["spec"], "json") == preset("sao-12deg")
+    assert tuple(entry["name"] for entry in listed) == preset_names()
+    explained = client.get(f"{API}/specs/presets/sao-12deg").json()
+    assert explained["sources"] == ["sao", "hipparcos"]
+    assert spec_from_dict(content_of_toml(explained["toml"], "text"), "text") == preset("sao-12deg")
+    assert spec_from_dict(explained["spec"], "json") == preset("sao-12deg")
     wrong = refused(client.get(f"{API}/specs/presets/sao-12degs"), 422)
     assert "did you mean 'sao-12deg'?" in wrong["detail"]
     assert (wrong["code"], wrong["key"]) == (2, "preset")
 
 
 def test_a_spec_is_checked_as_toml_as_json_and_as_a_changed_preset(client, small_spec, small):
-    given = [
+    requests = [
         {"content": small_spec, "headers": TOML},
         {"json": {"toml": small_spec}},
         {"json": {"spec": small.model_dump(mode="json")}},
     ]
-    for body in given:
+    for body in requests:
         answer = client.post(f"{API}/specs/validate", **body)
         assert answer.status_code == 200
         assert spec_from_dict(answer.json()["spec"], "answer") == small
@@ -104,8 +104,8 @@ def test_no_request_reads_a_map_by_its_path(client, small_spec, tmp_path, monkey
     spec = small_spec.replace('"sao"', '"secret.toml"')
     for path in ("validate", "estimate", "coverage"):
         answer = client.post(f"{API}/specs/{path}", content=spec, headers=TOML)
-        told = refused(answer, 422)
-        assert (told["key"], "hunter2" in answer.text) == ("catalog.source", False)
+        problem = refused(answer, 422)
+        assert (problem["key"], "hunter2" in answer.text) == ("catalog.source", False)
 
 
 JSON, PICTURE = {"content-type": "application/json"}, {"content-type": "image/png"}
@@ -145,16 +145,16 @@ def test_a_body_that_is_not_a_spec_is_refused(client, path, kind, content, statu
 def test_an_estimate_is_that_of_the_pipeline(client, small, small_spec):
     answer = client.post(f"{API}/specs/estimate", content=small_spec, headers=TOML)
     assert answer.status_code == 200
-    found = answer.json()
+    figures = answer.json()
     read = read_draft(small, {})
     choice = choose_stars(read, small)
-    assert found["guide_stars"] == len(choice.selected.guide_stars)
-    assert found["fields"]["count"] == small.boresights.count
-    assert found["fields"]["stars"]["minimum"] == choice.fields.count.min()
-    assert found["total_bytes"] == sum(found["files"].values())
-    assert found["refusals"] == []
-    assert found["filters"][-1]["stars"] == found["guide_stars"]
-    assert found["in_words"].startswith("estimate: ")
+    assert figures["guide_stars"] == len(choice.selected.guide_stars)
+    assert figures["fields"]["count"] == small.boresights.count
+    assert figures["fields"]["stars"]["minimum"] == choice.fields.count.min()
+    assert figures["total_bytes"] == sum(figures["files"].values())
+    assert figures["refusals"] == []
+    assert figures["filters"][-1]["stars"] == figures["guide_stars"]
+    assert figures["in_words"].startswith("estimate: ")
 
 
 def test_a_catalog_that_is_not_here_is_reported(client):
@@ -176,11 +176,11 @@ def test_a_first_spec_is_that_of_init(client):
         time.sleep(0.2 * int(answer.headers["retry-after"]))
         answer = client.post(f"{API}/specs/starter", json=wish)
     assert answer.status_code == 200
-    found = answer.json()
+    figures = answer.json()
     expected = starter_spec("My cam", CameraSpec(**camera))
-    assert found["checked"]["spec"] == expected.spec.model_dump(mode="json")
-    assert found["thinned"]["guide_stars"] == expected.thinned.guide_stars
-    assert found["in_words"] == expected.cost.in_words
+    assert figures["checked"]["spec"] == expected.spec.model_dump(mode="json")
+    assert figures["thinned"]["guide_stars"] == expected.thinned.guide_stars
+    assert figures["in_words"] == expected.cost.in_words
     wrong = {**camera, "fov_x_deg": 500.0}
     assert refused(client.post(f"{API}/specs/starter", json={"camera": wrong}), 422)
     deep = {"camera": {**camera, "fov_x_deg": 100.0}, "faint_limit_mag": 12.0}
@@ -191,12 +191,14 @@ def test_a_first_spec_is_that_of_init(client):
 
 def test_catalogs_say_whether_they_are_here_and_what_was_read(client, small_spec):
     client.post(f"{API}/specs/estimate", content=small_spec, headers=TOML)
-    found = {one["name"]: one for one in client.get(f"{API}/catalogs").json()["catalogs"]}
-    assert found["sao"]["is_here"]
-    assert found["gaia"]["is_here"]
-    assert not found["2mass"]["is_here"]
-    assert "starcat fetch 2mass" in found["2mass"]["hint"]
-    assert found["sao"]["read"][0] == {
+    catalogs = {
+        catalog["name"]: catalog for catalog in client.get(f"{API}/catalogs").json()["catalogs"]
+    }
+    assert catalogs["sao"]["is_here"]
+    assert catalogs["gaia"]["is_here"]
+    assert not catalogs["2mass"]["is_here"]
+    assert "starcat fetch 2mass" in catalogs["2mass"]["hint"]
+    assert catalogs["sao"]["read"][0] == {
         "band": "V", "epoch_jyear": 2026.0, "stars": 600, "brightest_mag": 2.0,
         "faintest_mag": 6.4,
     }  # fmt: skip
@@ -215,9 +217,9 @@ def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
 
     monkeypatch.setattr(catalogs_module, "read_draft", counted)
     catalogs = Catalogs()
-    found: list[int] = []
+    counts: list[int] = []
     threads = [
-        threading.Thread(target=lambda: found.append(catalogs.estimate(small).cost.stars))
+        threading.Thread(target=lambda: counts.append(catalogs.estimate(small).cost.stars))
         for _ in range(6)
     ]
     for thread in threads:
@@ -225,13 +227,15 @@ def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
     for thread in threads:
         thread.join()
     assert len(calls) == 1
-    assert len(set(found)) == 1
-    assert len(found) == 6
-    [sao] = [one for one in offered_catalogs(catalogs.catalogs_read()) if one.name == "sao"]
-    assert [(one.source, one.stars) for one in sao.read] == [("sao", 600)]
+    assert len(set(counts)) == 1
+    assert len(counts) == 6
+    [sao] = [
+        catalog for catalog in offered_catalogs(catalogs.catalogs_read()) if catalog.name == "sao"
+    ]
+    assert [(catalog.source, catalog.stars) for catalog in sao.read] == [("sao", 600)]
     source = Path(os.environ["STARCAT_CATALOGS"]) / "sao.dat"
     os.utime(source)
-    assert catalogs.estimate(small).cost.stars == found[0]
+    assert catalogs.estimate(small).cost.stars == counts[0]
     assert len(calls) == 2  # the file has changed
     catalogs.close()
 
@@ -247,10 +251,10 @@ def test_a_request_that_waits_too_long_gets_a_time_to_repeat_it(small, monkeypat
         catalogs = ChildCatalogs(wait_s=0.05)
         monkeypatch.setattr(catalogs, "_sent", never)
         for _ in range(2):
-            with pytest.raises(Problem, match="sao: being read, which takes longer") as told:
+            with pytest.raises(Problem, match="sao: being read, which takes longer") as caught:
                 await catalogs.enough_limit(small)
-            assert told.value.status == 503
-            assert told.value.headers == {"Retry-After": "5"}
+            assert caught.value.status == 503
+            assert caught.value.headers == {"Retry-After": "5"}
         answers[0].set_result((DONE, [4.0, 6.0]))
         assert await catalogs.enough_limit(small) == (4.0, 6.0)
 
@@ -300,9 +304,9 @@ def test_a_user_can_have_few_requests_wait_and_others_are_answered(small, monkey
 def test_files_that_are_too_large_are_read_to_a_limit_only(small, monkeypatch):
     monkeypatch.setattr(catalogs_module, "MAX_INPUT_BYTES", 1000)
     catalogs = Catalogs()
-    with pytest.raises(Problem, match="more than an estimate reads whole") as told:
+    with pytest.raises(Problem, match="more than an estimate reads whole") as caught:
         catalogs.estimate(small)
-    assert (told.value.status, told.value.key) == (413, "catalog.read_limit_mag")
+    assert (caught.value.status, caught.value.key) == (413, "catalog.read_limit_mag")
     content = json.loads(small.model_dump_json())
     content["catalog"]["read_limit_mag"] = 6.2
     assert catalogs.estimate(spec_from_dict(content, "small")).cost.stars > 0

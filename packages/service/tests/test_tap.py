@@ -57,7 +57,7 @@ def error_of(answer: Response) -> str:
     """Return the words of an error as DALI has it."""
     assert answer.headers["content-type"].startswith("application/x-votable+xml")
     tree = ElementTree.fromstring(answer.content)
-    [status] = [one for one in tree.iter() if one.get("name") == "QUERY_STATUS"]
+    [status] = [element for element in tree.iter() if element.get("name") == "QUERY_STATUS"]
     assert status.get("value") == "ERROR"
     return status.text or ""
 
@@ -78,10 +78,10 @@ def test_votables_have_the_rows_of_sql(client, ask, bright):
     form = {"request": "doQuery", "lang": "ADQL-2.1", "query": BRIGHT, "maxrec": "1000"}
     for answer in (ask(BRIGHT, RESPONSEFORMAT="votable/td"), client.post("/tap/sync", data=form)):
         assert answer.headers["content-type"].startswith("application/x-votable+xml")
-        found = table_of(answer)
-        assert [tuple(row) for row in found] == bright
-        assert found["mag"].unit == "mag"
-        assert found["ra_deg"].meta["ucd"] == "pos.eq.ra;meta.main"
+        rows = table_of(answer)
+        assert [tuple(row) for row in rows] == bright
+        assert rows["mag"].unit == "mag"
+        assert rows["ra_deg"].meta["ucd"] == "pos.eq.ra;meta.main"
 
 
 def test_rows_that_are_left_out_are_reported(ask, bright):
@@ -98,10 +98,10 @@ def test_rows_that_are_left_out_are_reported(ask, bright):
 
 
 def whole_of(spool: Spool) -> bytes:
-    found = b""
-    while part := spool.part(len(found)):
-        found += part
-    return found
+    whole = b""
+    while part := spool.part(len(whole)):
+        whole += part
+    return whole
 
 
 def test_a_slow_reader_does_not_block_others(client):
@@ -155,9 +155,9 @@ def test_a_query_ends_when_its_client_goes(client):
 
 def test_tap_schema_has_what_released_schemas_say(ask):
     of_stars = "WHERE table_name = 'small.stars' ORDER BY column_index"
-    found = table_of(ask(f"SELECT * FROM TAP_SCHEMA.columns {of_stars}"))
-    by_name = {row["column_name"]: row for row in found}
-    assert found["column_name"][0] == "star_id"
+    rows = table_of(ask(f"SELECT * FROM TAP_SCHEMA.columns {of_stars}"))
+    by_name = {row["column_name"]: row for row in rows}
+    assert rows["column_name"][0] == "star_id"
     assert '"catalog"' in by_name, "a word of ADQL stands in quotes"
     assert by_name["pm_dec_mas_yr"]["unit"] == "mas.yr**-1"
     assert by_name["ra_deg"]["ucd"] == "pos.eq.ra;meta.main"
@@ -201,14 +201,14 @@ def test_tables_are_described_with_and_without_columns(client):
     assert len(list(whole.iter("column"))) > 90
     assert not list(short.iter("column"))
     assert names == [table.findtext("name") for table in short.iter("table")]
-    one = ElementTree.fromstring(client.get("/tap/tables/small.stars").content)
-    assert one.findtext("name") == "small.stars"
+    table = ElementTree.fromstring(client.get("/tap/tables/small.stars").content)
+    assert table.findtext("name") == "small.stars"
 
 
 def test_tables_are_described_as_tap_plus_reads_them(client):
-    one = client.get("/tap/tables", params={"tables": "small.stars"}).text
-    assert re.findall(r"<table .*?<name>(.*?)</name>", one) == ["small.stars"]
-    assert one.count('<column esatapplus:flags="0">') == one.count("</column>") > 20
+    described = client.get("/tap/tables", params={"tables": "small.stars"}).text
+    assert re.findall(r"<table .*?<name>(.*?)</name>", described) == ["small.stars"]
+    assert described.count('<column esatapplus:flags="0">') == described.count("</column>") > 20
     assert "esatapplus" not in client.get("/tap/tables").text
     short = client.get("/tap/tables", params={"only_tables": "true"}).text
     assert "small.stars" in short
@@ -217,14 +217,14 @@ def test_tables_are_described_as_tap_plus_reads_them(client):
 
 def test_capabilities_name_what_there_is_and_every_example_runs(client, ask):
     text = client.get("/tap/capabilities").text
-    for told in (
+    for words in (
         "features-adqlgeo", "<form>POLYGON</form>", "upload-inline", "votable-td",
         f'use="base">{LOCAL}/tap<', "VOSI#tables-1.1", "<form>IN_UNIT</form>",
     ):  # fmt: skip
-        assert told in text
+        assert words in text
     assert "<available>true</available>" in client.get("/tap/availability").text
     page = ElementTree.fromstring(client.get("/tap/examples").content)
-    queries = [one.text for one in page.iter() if one.get("property") == "query"]
+    queries = [element.text for element in page.iter() if element.get("property") == "query"]
     assert len(queries) == 4
     for query in queries:
         assert len(table_of(ask(query))) > 0, query
@@ -253,8 +253,8 @@ UPLOADED = Table(
 
 def ask_with(client: TestClient, name: str, content: bytes, query: str) -> Response:
     """Send a query together with a table."""
-    given = {"QUERY": query, "UPLOAD": f"{name},param:file1"}
-    return client.post("/tap/sync", data=given, files={"file1": ("any.vot", content)})
+    parameters = {"QUERY": query, "UPLOAD": f"{name},param:file1"}
+    return client.post("/tap/sync", data=parameters, files={"file1": ("any.vot", content)})
 
 
 @pytest.mark.parametrize("serialization", ["tabledata", "binary", "binary2"])
@@ -262,17 +262,15 @@ def test_an_uploaded_table_comes_back(client, serialization):
     # BINARY has no way to say that an integer is missing.
     has_nulls = serialization != "binary"
     sent = votable(UPLOADED if has_nulls else UPLOADED.filled(2), serialization)
-    found = table_of(
-        ask_with(client, "Group", sent, 'SELECT * FROM TAP_UPLOAD."Group" ORDER BY ra')
-    )
-    assert found.colnames == UPLOADED.colnames
-    assert np.ma.getmaskarray(found["id"]).tolist() == [False, has_nulls, False]
-    assert found["id"].dtype == np.int32
-    assert found["x"].dtype == np.float32
-    assert found["ra"].unit == "deg"
-    assert list(found["Name"]) == ["α Cas", "b", ""]
-    assert found["flag"].tolist() == [True, False, True]
-    assert [list(one) for one in found["group"]] == [[1, 2], [3, 4], [5, 6]]
+    rows = table_of(ask_with(client, "Group", sent, 'SELECT * FROM TAP_UPLOAD."Group" ORDER BY ra'))
+    assert rows.colnames == UPLOADED.colnames
+    assert np.ma.getmaskarray(rows["id"]).tolist() == [False, has_nulls, False]
+    assert rows["id"].dtype == np.int32
+    assert rows["x"].dtype == np.float32
+    assert rows["ra"].unit == "deg"
+    assert list(rows["Name"]) == ["α Cas", "b", ""]
+    assert rows["flag"].tolist() == [True, False, True]
+    assert [list(group) for group in rows["group"]] == [[1, 2], [3, 4], [5, 6]]
 
 
 def test_an_uploaded_table_is_joined(client, bright):
@@ -284,14 +282,14 @@ def test_an_uploaded_table_is_joined(client, bright):
     answer = ask_with(client, "mine", votable(ids), query)
     assert list(table_of(answer)["star_id"]) == [row[0] for row in bright][::2]
     scratch = client.app.state.service.paths.scratch
-    left = {path.name.split("-")[0] for path in scratch.iterdir()}
-    assert not left & {"upload", "sync", "answer"}
+    names = {path.name.split("-")[0] for path in scratch.iterdir()}
+    assert not names & {"upload", "sync", "answer"}
 
 
 def document(fields: str, data: str = "", **facts: object) -> bytes:
-    told = "".join(f' {name}="{value}"' for name, value in facts.items())
+    attributes = "".join(f' {name}="{value}"' for name, value in facts.items())
     space = "http://www.ivoa.net/xml/VOTable/v1.3"
-    table = f"<TABLE{told}>{fields}<DATA>{data}</DATA></TABLE>"
+    table = f"<TABLE{attributes}>{fields}<DATA>{data}</DATA></TABLE>"
     return f'<VOTABLE version="1.4" xmlns="{space}"><RESOURCE>{table}</RESOURCE></VOTABLE>'.encode()
 
 
@@ -329,11 +327,11 @@ HOSTILE = [
 ]
 
 
-@pytest.mark.parametrize(("content", "status", "told"), HOSTILE, ids=range(len(HOSTILE)))
-def test_uploads_that_must_not_be_read_are_refused(client, content, status, told):
+@pytest.mark.parametrize(("content", "status", "words"), HOSTILE, ids=range(len(HOSTILE)))
+def test_uploads_that_must_not_be_read_are_refused(client, content, status, words):
     answer = ask_with(client, "t", content, "SELECT * FROM TAP_UPLOAD.t")
     assert answer.status_code == status
-    assert told in answer.text
+    assert words in answer.text
     assert "defect" not in answer.text
 
 
@@ -344,13 +342,13 @@ def test_uploads_that_must_not_be_read_are_refused(client, content, status, told
 def make(client) -> Callable[..., str]:
     """Make a job; return its address."""
 
-    def made(query: str, **parameters: str) -> str:
+    def job_address(query: str, **parameters: str) -> str:
         data = {"LANG": "ADQL", "QUERY": query, **parameters}
         answer = client.post("/tap/async", data=data, follow_redirects=False)
         assert answer.status_code == 303, answer.text
         return answer.headers["location"]
 
-    return made
+    return job_address
 
 
 def phase_of(client: TestClient, job: str) -> str:
@@ -359,10 +357,10 @@ def phase_of(client: TestClient, job: str) -> str:
 
 def wait_for(client: TestClient, job: str, *phases: str) -> str:
     ends = time.monotonic() + 30.0
-    while (found := phase_of(client, job)) not in phases:
-        assert time.monotonic() < ends, found
-        client.get(job, params={"WAIT": "5", "PHASE": found})
-    return found
+    while (phase := phase_of(client, job)) not in phases:
+        assert time.monotonic() < ends, phase
+        client.get(job, params={"WAIT": "5", "PHASE": phase})
+    return phase
 
 
 def test_a_job_gives_what_a_query_gives(client, make, bright):
@@ -377,8 +375,8 @@ def test_a_job_gives_what_a_query_gives(client, make, bright):
     assert href == f"{job}/results/result"
     assert [tuple(row) for row in table_of(client.get(href))] == bright
     assert document.findtext("uws:runId", namespaces=UWS) == "mine"
-    given = {p.get("id"): p.text for p in document.iterfind(".//uws:parameter", UWS)}
-    assert given["QUERY"] == BRIGHT
+    parameters = {p.get("id"): p.text for p in document.iterfind(".//uws:parameter", UWS)}
+    assert parameters["QUERY"] == BRIGHT
     assert client.get(f"{job}/error").status_code == 404
     again = client.post(f"{job}/parameters", data={"QUERY": "SELECT 1"})
     assert "COMPLETED" in error_of(again)
@@ -438,7 +436,7 @@ def test_jobs_are_listed_and_chosen_from(client, make):
 
     def listed(**parameters: str) -> list[str]:
         tree = ElementTree.fromstring(client.get("/tap/async", params=parameters).content)
-        return [str(one.get(f"{{{UWS['xlink']}}}href")) for one in tree]
+        return [str(reference.get(f"{{{UWS['xlink']}}}href")) for reference in tree]
 
     assert listed(LAST="2") == jobs[:0:-1]
     assert jobs[0] in listed(PHASE="ABORTED")
@@ -496,16 +494,16 @@ def test_jobs_outlive_the_server(tmp_path, small_database, bright):
     service = Service(settings)
     jobs = service.query_jobs
     client_of_jobs = asker.set("testclient")  # without a token, jobs belong to their client
-    made = [jobs.create("anonymous").job_id for _ in range(3)]
+    ids = [jobs.create("anonymous").job_id for _ in range(3)]
     asker.reset(client_of_jobs)
-    for job_id in made:
+    for job_id in ids:
         jobs.set_parameters(job_id, [("QUERY", BRIGHT)], {})
-    for job_id in made[:2]:
+    for job_id in ids[:2]:
         jobs.run(job_id)
     begin_next(service.records, (QUERY,))
     service.close()
     with TestClient(make_app(settings), base_url=LOCAL) as client:
-        addresses = [f"{LOCAL}/tap/async/{job_id}" for job_id in made]
+        addresses = [f"{LOCAL}/tap/async/{job_id}" for job_id in ids]
         assert error_of(client.get(f"{addresses[0]}/error")) == ENDED_WITH_SERVER
         assert wait_for(client, addresses[1], "COMPLETED", "ERROR") == "COMPLETED"
         assert len(table_of(client.get(f"{addresses[1]}/results/result"))) == len(bright)
@@ -531,8 +529,8 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_database):
         quoted = f'"_2mass_{"0" * 16}"'
         assert names() == [quoted, "small", "small_1_0_0", "small_1_0_0_2", "tap_schema"]
         query = f"SELECT COUNT(*) AS n FROM {quoted}.stars"
-        found = table_of(client.get("/tap/sync", params={"QUERY": query}))
-        assert list(found["n"]) == [pq.read_metadata(stars).num_rows]
+        table = table_of(client.get("/tap/sync", params={"QUERY": query}))
+        assert list(table["n"]) == [pq.read_metadata(stars).num_rows]
         # Databases that cannot be opened are left out, and the others are there.
         (other / "stars.parquet").write_bytes(b"PAR1 no table PAR1")
         (other / "manifest.json").touch()
@@ -565,8 +563,8 @@ def test_a_new_build_renames_no_table(tmp_path, small_database, picky_database, 
         add_database(root, picky_database, "0" * 16)
         assert [rows(query) for query in queries] == [before, before]
         about = "SELECT schema_name, description FROM tap_schema.schemas ORDER BY schema_name"
-        told = dict(rows(about))
+        descriptions = dict(rows(about))
         versions = ["small_1_0_0", "small_1_0_0_2", "small_1_10_0", "small_1_9_0"]
-        assert list(told) == ["small", *versions, "tap_schema"]
-        assert told["small"].startswith("The newest version: the tables of small_1_10_0.")
+        assert list(descriptions) == ["small", *versions, "tap_schema"]
+        assert descriptions["small"].startswith("The newest version: the tables of small_1_10_0.")
         assert len(rows(queries[0].replace("1_0_0", "1_0_0_2"))) < len(before)

@@ -44,9 +44,9 @@ EXPLAINED = {
 def rows(small_database: Path) -> list[tuple[object, ...]]:
     """What 'starcat sql' gives for the question of a cone."""
     with open_session([str(small_database)]) as session, session.ask(SAME_IN_SQL) as asked:
-        found = asked.rows(10_000)
-    assert len(found) > 10
-    return found
+        answer = asked.rows(10_000)
+    assert len(answer) > 10
+    return answer
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def url(served: Served) -> str:
 
 
 def rows_of(table: Table) -> list[tuple[object, ...]]:
-    return [tuple(one.item() if hasattr(one, "item") else one for one in row) for row in table]
+    return [tuple(cell.item() if hasattr(cell, "item") else cell for cell in row) for row in table]
 
 
 @pytest.mark.skipif(shutil.which("stilts") is None, reason="stilts is not installed")
@@ -104,8 +104,8 @@ def test_pyvo_uploads(service, rows):
         "ORDER BY s.star_id"
     )
     for run in (service.run_sync, service.run_async):
-        found = run(query, uploads={"ids": ids}).to_table()
-        assert list(found["star_id"]) == list(ids["star_id"])
+        table = run(query, uploads={"ids": ids}).to_table()
+        assert list(table["star_id"]) == list(ids["star_id"])
 
 
 def test_pyvo_follows_a_job(service, rows):
@@ -115,17 +115,17 @@ def test_pyvo_follows_a_job(service, rows):
     job.wait(phases=["COMPLETED", "ERROR"], timeout=60.0)
     assert job.phase == "COMPLETED"
     assert rows_of(job.fetch_result().to_table()) == rows[:3]
-    assert job.job_id in [one.jobid for one in service.get_job_list()]
+    assert job.job_id in [listed.jobid for listed in service.get_job_list()]
     job.delete()
-    assert job.job_id not in [one.jobid for one in service.get_job_list()]
+    assert job.job_id not in [listed.jobid for listed in service.get_job_list()]
 
 
 def test_pyvo_gets_the_error(service):
     for run in (service.run_sync, service.run_async):
         with pytest.raises(DALQueryError, match="no column 'nothing'"):
             run("SELECT nothing FROM small.stars")
-    found = service.run_sync(CONE, maxrec=2)
-    assert (len(found), found.query_status) == (2, "OVERFLOW")
+    table = service.run_sync(CONE, maxrec=2)
+    assert (len(table), table.query_status) == (2, "OVERFLOW")
 
 
 @pytest.fixture
@@ -142,17 +142,17 @@ def test_astroquery_loads_tables(tap_plus):
     stars = next(table for name, table in tables.items() if name.endswith("small.stars"))
     assert "ra_deg" in [column.name for column in stars.columns]
     assert tap_plus.load_tables(only_names=True)
-    one = tap_plus.load_table("small.stars")
-    assert "mag" in [column.name for column in one.columns]
+    stars_table = tap_plus.load_table("small.stars")
+    assert "mag" in [column.name for column in stars_table.columns]
 
 
 @pytest.mark.parametrize("launch", ["launch_job", "launch_job_async"])
 @pytest.mark.parametrize("form", ["votable", "csv"])
 def test_astroquery_asks_at_once_and_later(tap_plus, rows, launch, form):
     job = getattr(tap_plus, launch)(CONE, output_format=form)
-    found = rows_of(job.get_results())
-    assert [row[0] for row in found] == [row[0] for row in rows]
-    assert [row[2:] for row in found] == [row[2:] for row in rows]
+    answer = rows_of(job.get_results())
+    assert [row[0] for row in answer] == [row[0] for row in rows]
+    assert [row[2:] for row in answer] == [row[2:] for row in rows]
 
 
 def test_astroquery_gets_the_reason_of_a_failed_job(tap_plus):
