@@ -71,7 +71,7 @@ MAX_MS = {
 
 
 @dataclass
-class Found:
+class Figures:
     """What the clients measured.
 
     Attributes
@@ -96,13 +96,13 @@ class Connection:
     ----------
     address : str
         Of the server.
-    own : str
+    local_ip : str
         Of the client.
     """
 
-    def __init__(self, address: str, own: str = "127.0.0.1") -> None:
+    def __init__(self, address: str, local_ip: str = "127.0.0.1") -> None:
         parts = urlsplit(address)
-        self._own = own
+        self._local_ip = local_ip
         self._host, self._port = parts.hostname or "", parts.port or 80
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
@@ -110,7 +110,7 @@ class Connection:
         """Send a request, and return status and content of the answer."""
         if self._streams is None:
             self._streams = await asyncio.open_connection(
-                self._host, self._port, local_addr=(self._own, 0)
+                self._host, self._port, local_addr=(self._local_ip, 0)
             )
         reader, writer = self._streams
         head = (
@@ -167,7 +167,7 @@ class Load:
     ends_at: float
     is_one_address: bool = False
 
-    async def client(self, number: int, found: Found) -> None:
+    async def client(self, number: int, figures: Figures) -> None:
         """Be one client."""
         draw = random.Random(number)
         connection = Connection(self.served.address, self.address(number))
@@ -177,14 +177,14 @@ class Load:
             kind = draw.choice(kinds)
             began = time.perf_counter()
             try:
-                told = await self._one(kind, draw, connection)
+                problem = await self._send(kind, draw, connection)
             except (OSError, EOFError, ValueError) as error:
-                told = f"{type(error).__name__}: {error}"
+                problem = f"{type(error).__name__}: {error}"
                 connection.close()
             if time.monotonic() > self.begins_at:
-                found.took_ms[kind].append(1e3 * (time.perf_counter() - began))
-            if told:
-                found.errors.append(f"{kind}: {told}")
+                figures.took_ms[kind].append(1e3 * (time.perf_counter() - began))
+            if problem:
+                figures.errors.append(f"{kind}: {problem}")
             await asyncio.sleep(draw.uniform(0.0, 2.0 * self.pause_s))
         connection.close()
 
@@ -192,25 +192,25 @@ class Load:
         """Return the address of a client."""
         return "127.0.0.1" if self.is_one_address else f"127.0.1.{number + 1}"
 
-    async def greedy(self, number: int, found: Found) -> None:
+    async def greedy(self, number: int, figures: Figures) -> None:
         """Be a client that asks for all it can get."""
-        own = self.address(number)
-        await asyncio.gather(*(self._greed(one, own, found) for one in range(AT_ONCE)))
+        local_ip = self.address(number)
+        await asyncio.gather(*(self._greed(first, local_ip, figures) for first in range(AT_ONCE)))
 
-    async def _greed(self, number: int, own: str, found: Found) -> None:
-        connection = Connection(self.served.address, own)
+    async def _greed(self, number: int, local_ip: str, figures: Figures) -> None:
+        connection = Connection(self.served.address, local_ip)
         with suppress(TimeoutError):
-            while (left_s := self.ends_at - time.monotonic()) > 0:
+            while (remaining_s := self.ends_at - time.monotonic()) > 0:
                 body = {"targets": [self.database], "query": ENDLESS[number % len(ENDLESS)]}
                 asked = connection.ask("POST", "/api/v1/sql", json.dumps(body).encode())
-                status, content = await asyncio.wait_for(asked, left_s)
-                found.greedy[status] += 1
+                status, content = await asyncio.wait_for(asked, remaining_s)
+                figures.greedy[status] += 1
                 if status >= 500:
-                    found.errors.append(f"greedy: {status} {content!r}")
+                    figures.errors.append(f"greedy: {status} {content!r}")
                 number += 1
         connection.close()
 
-    async def _one(self, kind: str, draw: random.Random, connection: Connection) -> str:
+    async def _send(self, kind: str, draw: random.Random, connection: Connection) -> str:
         """Do one request, and return what is wrong with the answer."""
         where = f"/api/v1/databases/{self.database}"
         if kind == "query":
@@ -242,7 +242,7 @@ class Load:
 
 async def run(
     load: Load, clients: int, greedy: int, meanwhile: Callable[[], Awaitable[None]]
-) -> Found:
+) -> Figures:
     """Let the clients do what they do.
 
     Parameters
@@ -258,24 +258,24 @@ async def run(
 
     Returns
     -------
-    Found
+    Figures
         What they measured.
     """
-    found = Found()
+    figures = Figures()
     await asyncio.gather(
-        *(load.client(number, found) for number in range(clients)),
-        *(load.greedy(clients + number, found) for number in range(greedy)),
+        *(load.client(number, figures) for number in range(clients)),
+        *(load.greedy(clients + number, figures) for number in range(greedy)),
         meanwhile(),
     )
-    return found
+    return figures
 
 
 def memory_mib(process: int) -> float:
     """Return the memory of a process and of its child processes, each page counted once."""
     total = 0.0
-    for one in family(process):
+    for number in family(process):
         with suppress(OSError):
-            lines = Path(f"/proc/{one}/smaps_rollup").read_text().splitlines()
+            lines = Path(f"/proc/{number}/smaps_rollup").read_text().splitlines()
             total += next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
     return total / 1024
 
@@ -290,21 +290,21 @@ def family(process: int) -> Iterator[int]:
 
 
 def report(
-    rows: Rows, found: Found, seconds: float, *, is_quick: bool, has_greedy: bool = False
+    rows: Rows, figures: Figures, seconds: float, *, is_quick: bool, has_greedy: bool = False
 ) -> None:
     """Print what was measured; the quick form judges no times."""
     print(f"{'kind':10} {'requests':>9} {'a second':>9} {'p50 ms':>8} {'p99 ms':>8} {'worst':>8}")
-    for kind, took in found.took_ms.items():
+    for kind, took in figures.took_ms.items():
         half, most, worst = np.percentile(took, [50, 99, 100]) if took else (0.0, 0.0, 0.0)
         is_fast = is_quick or most <= (500.0 if has_greedy else MAX_MS[kind])
         rows.expect(is_fast, f"{kind}: 99 % took {most:.0f} ms, which is too long")
         rows.expect(is_quick or len(took) > 0, f"{kind}: no request was sent")
         rate = len(took) / seconds
         print(f"{kind:10} {len(took):9} {rate:9.1f} {half:8.1f} {most:8.1f} {worst:8.1f}")
-    print(f"errors: {len(found.errors)}; load of the machine: {os.getloadavg()[0]:.1f}")
+    print(f"errors: {len(figures.errors)}; load of the machine: {os.getloadavg()[0]:.1f}")
     if has_greedy:
-        print(f"answers to greedy clients, by status: {dict(found.greedy)}")
-    rows.failed.extend(found.errors)
+        print(f"answers to greedy clients, by status: {dict(figures.greedy)}")
+    rows.failed.extend(figures.errors)
 
 
 def main(rows: Rows) -> None:
@@ -322,38 +322,51 @@ def main(rows: Rows) -> None:
     options.add_argument(
         "--largest-mib", type=float, default=1.0, help="files of this size at most"
     )
-    given = options.asked()
+    arguments = options.asked()
     limits = {"requests_per_minute": 10_000_000, "anonymous": "publisher", "jobs_waiting": 100}
     with (
         tempfile.TemporaryDirectory(prefix="starcat-load-") as home,
         serve(Path(home) / "root", Path(home) / "log", **limits) as served,
     ):
         client = Client(served.address)
-        job = client.build(SPEC.format(number=0, source=given.source))
+        job = client.build(SPEC.format(number=0, source=arguments.source))
         database = job["result"]["database"]
         listed = client.files(database)
-        most = given.largest_mib * 2**20
-        files = [(one["path"], one["sha256"]) for one in listed if one["bytes"] <= most]
+        most = arguments.largest_mib * 2**20
+        files = [(file["path"], file["sha256"]) for file in listed if file["bytes"] <= most]
         client.sql([database], CONE.format(ra=0, dec=0))
         queued: list[str] = []
 
         async def meanwhile() -> None:
-            for number in range(1, given.builds + 1):
-                spec = SPEC.format(number=number, source=given.source)
+            for number in range(1, arguments.builds + 1):
+                spec = SPEC.format(number=number, source=arguments.source)
                 queued.append(await asyncio.to_thread(client.submit, spec))
 
         before = memory_mib(served.process.pid)
-        begins_at = time.monotonic() + given.warm_s
-        ends_at = begins_at + given.seconds
+        begins_at = time.monotonic() + arguments.warm_s
+        ends_at = begins_at + arguments.seconds
         load = Load(
-            served, database, job["id"], files, given.pause_s, begins_at, ends_at, given.one_address
+            served,
+            database,
+            job["id"],
+            files,
+            arguments.pause_s,
+            begins_at,
+            ends_at,
+            arguments.one_address,
         )
-        found = asyncio.run(run(load, given.clients, given.greedy, meanwhile))
-        report(rows, found, given.seconds, is_quick=given.quick, has_greedy=given.greedy > 0)
-        for one in queued:
-            state = client.wait(one)["state"]
-            print(f"build {one}: {state}")
-            rows.expect(state == "done", f"build {one}: {state}")
+        figures = asyncio.run(run(load, arguments.clients, arguments.greedy, meanwhile))
+        report(
+            rows,
+            figures,
+            arguments.seconds,
+            is_quick=arguments.quick,
+            has_greedy=arguments.greedy > 0,
+        )
+        for queued_id in queued:
+            state = client.wait(queued_id)["state"]
+            print(f"build {queued_id}: {state}")
+            rows.expect(state == "done", f"build {queued_id}: {state}")
         after = memory_mib(served.process.pid)
         print(f"memory of the server and its processes: {before:.0f} MiB before, {after:.0f} after")
 

@@ -116,7 +116,7 @@ class Crowd:
 
     def request(self, kind: str, draw: random.Random) -> tuple[str, str, bytes]:
         """Return method, path and body of a request."""
-        own, ra = f"/databases/{self.database}", draw.uniform(0.0, 360.0)
+        database_path, ra = f"/databases/{self.database}", draw.uniform(0.0, 360.0)
         dec = float(np.degrees(np.arcsin(draw.uniform(-1.0, 1.0))))
         if kind == "healthz":
             return "GET", "/healthz", b""
@@ -133,7 +133,14 @@ class Crowd:
                 changes["epoch_jyear"] = str(2016.0 + draw.randrange(EPOCHS))
             asked = {"preset": "gaia-12deg", "changes": changes}
             return "POST", "/api/v1/specs/estimate", json.dumps(asked).encode()
-        pages = ("/", "/databases", own, f"/api/v1{own}", "/new", f"/api/v1{own}/manifest")
+        pages = (
+            "/",
+            "/databases",
+            database_path,
+            f"/api/v1{database_path}",
+            "/new",
+            f"/api/v1{database_path}/manifest",
+        )
         return "GET", draw.choice(pages), b""
 
     async def greedy(self, number: int) -> None:
@@ -184,7 +191,7 @@ def main(rows: Rows) -> None:
     options.size("--greedy", 2, 1, "clients that send cross joins")
     options.size("--rounds", 1, 1, "times that the load is repeated on the same server")
     options.add_argument("--source", default="gaia", help="catalog that databases are built from")
-    given = options.asked()
+    arguments = options.asked()
     limits = {"requests_per_minute": 10_000_000, "anonymous": "publisher", "jobs_waiting": 100}
     with (
         tempfile.TemporaryDirectory(prefix="starcat-load-") as home,
@@ -192,12 +199,16 @@ def main(rows: Rows) -> None:
     ):
         client = Client(served.address)
         print(f"server process after its start: {resident_mb(served.process.pid):.0f} MB")
-        database = client.build(SPEC.format(number=0, source=given.source))["result"]["database"]
+        database = client.build(SPEC.format(number=0, source=arguments.source))["result"][
+            "database"
+        ]
         print(f"server process before the load: {resident_mb(served.process.pid):.0f} MB")
-        for _ in range(given.rounds):
+        for _ in range(arguments.rounds):
             figures = Figures()
-            crowd = Crowd(served, database, time.monotonic() + given.seconds, figures)
-            job = asyncio.run(load(crowd, given.clients, given.greedy, client, given.source))
+            crowd = Crowd(served, database, time.monotonic() + arguments.seconds, figures)
+            job = asyncio.run(
+                load(crowd, arguments.clients, arguments.greedy, client, arguments.source)
+            )
             print("\n".join(table(figures.took_ms)))
             print(f"answers to greedy clients, by status: {dict(figures.greedy)}")
             print(f"errors: {dict(figures.errors)}; load of the machine: {os.getloadavg()[0]:.1f}")
@@ -207,7 +218,7 @@ def main(rows: Rows) -> None:
                 f"its child processes {figures.children_mb:.0f} MB"
             )
             rows.expect(
-                given.quick or figures.server_mb <= MAX_SERVER_MB,
+                arguments.quick or figures.server_mb <= MAX_SERVER_MB,
                 f"the server process took {figures.server_mb:.0f} MB, expected {MAX_SERVER_MB:g}",
             )
             # Catalogs for other epochs are read in sequence; a request that waits too long gets

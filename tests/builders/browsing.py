@@ -97,15 +97,15 @@ LOOKS = (("light", 360), ("dark", 1280), ("dark", 360), ("light", 1280))
 def complaints_of_axe(page: Page) -> list[tuple[object, ...]]:
     """Check in all looks that a page fits its window; return what axe finds to be wrong."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    found = []
+    complaints = []
     for theme, width in LOOKS:
         look(page, theme, width)
         assert page.evaluate("document.documentElement.scrollWidth") <= width
-        for one in axe.run(page).response["violations"]:
-            nodes = [node["html"][:160] for node in one["nodes"][:3]]
-            found.append((page.url, theme, width, one["id"], nodes))
+        for violation in axe.run(page).response["violations"]:
+            nodes = [node["html"][:160] for node in violation["nodes"][:3]]
+            complaints.append((page.url, theme, width, violation["id"], nodes))
     look(page, "light", 1280)
-    return found
+    return complaints
 
 
 def begin(page: Page) -> None:

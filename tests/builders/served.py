@@ -53,13 +53,13 @@ class Served:
         timeout_s: float = 20.0,
     ) -> Answer:
         """Send a request letter by letter: nothing is put in order on the way, as clients do."""
-        given = {"Host": f"127.0.0.1:{self.port}", **(headers or {})}
+        all_headers = {"Host": f"127.0.0.1:{self.port}", **(headers or {})}
         if body is not None:
-            given.setdefault("Content-Length", str(len(body)))
+            all_headers.setdefault("Content-Length", str(len(body)))
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=timeout_s)
         try:
             connection.putrequest(method, target, skip_host=True, skip_accept_encoding=True)
-            for name, value in given.items():
+            for name, value in all_headers.items():
                 connection.putheader(name, value)
             connection.endheaders()
             if body:

@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,7 +112,7 @@ def waiting_build(service: Service, key: str) -> Job:
 def every_route() -> Iterator[tuple[str, str]]:
     """Give method and path of every route of the application; parameters are in braces."""
     for prefix, routers in ((API, RESOURCES), ("", OTHERS)):
-        for route in (one for router in routers for one in router.routes):
+        for route in chain.from_iterable(router.routes for router in routers):
             assert isinstance(route, APIRoute)
             yield from ((method, prefix + route.path) for method in sorted(route.methods))
 
