@@ -278,7 +278,9 @@ def error_votable(message: str) -> bytes:
 
 def examples(tables: Tables) -> list[tuple[str, str, str]]:
     """Return queries that run on the existing tables: names, titles and texts."""
-    with_places = [table for table in tables if _has(table, *POSITION, "mag")]
+    with_places = [
+        table for table in tables if {*POSITION, "mag"} <= {column.name for column in table.columns}
+    ]
     # The table of rejected stars also has positions.
     stars = min(with_places, key=lambda table: table.name != "stars", default=None)
     point = f"POINT('ICRS', {', '.join(map(adql_name, POSITION))})"
@@ -304,7 +306,3 @@ def examples_page(tables: Tables) -> str:
         '<body vocab="http://www.ivoa.net/rdf/examples#">\n'
         f"<h1>Examples of ADQL</h1>\n{parts}\n</body>\n</html>\n"
     )
-
-
-def _has(table: TapTable, *names: str) -> bool:
-    return set(names) <= {column.name for column in table.columns}

@@ -231,7 +231,8 @@ class ConfinedEngine:
                 elif kind == ERROR:
                     reported = from_json(content)
                     is_over = isinstance(reported, dict) and reported.get("is_last") is False
-                    raise _query_error(error_of(reported))
+                    cause = error_of(reported)
+                    raise cause if isinstance(cause, QueryError) else QueryError(str(cause))
                 elif kind == PART:
                     parts.append(decoded_rows(content))
                 else:
@@ -314,10 +315,6 @@ def _late(allowance: Allowance, waited_s: float, taken_s: float) -> QueryLimitEr
             "processor time; ask again later"
         )
     return allowance.late()
-
-
-def _query_error(error: Exception) -> QueryError:
-    return error if isinstance(error, QueryError) else QueryError(str(error))
 
 
 def _percent(content: bytes | bytearray) -> int:
