@@ -21,7 +21,7 @@ help: ## list the targets
 
 $(RUNS): pyproject.toml packages/lab/pyproject.toml lock.txt
 	@$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "starcat needs Python 3.11 or newer"'
-	@echo "making $(VENV) and installing starcat with its libraries (700 MB; a minute or two)"
+	@echo "making $(VENV) and installing starcat with its libraries (900 MB; a minute or two)"
 	@$(PYTHON) -m venv $(VENV)
 	@sed '/^# --- service/,$$d' lock.txt > $(VENV)/run.txt
 	@$(PIP) --require-hashes --no-deps --requirement $(VENV)/run.txt
@@ -38,7 +38,7 @@ $(SERVED): $(RUNS) packages/service/pyproject.toml lock.txt
 	@touch $(SERVED)
 
 $(READY): $(RUNS) packages/service/pyproject.toml lock.txt
-	@echo "installing the tools of the tests into $(VENV) (another 300 MB; a minute)"
+	@echo "installing the tools of the tests into $(VENV) (another 900 MB; a minute)"
 	@$(PIP) --require-hashes --no-deps --requirement lock.txt
 	@$(PIP) --no-deps --no-build-isolation --editable packages/service
 	@$(COMPILE)

@@ -59,10 +59,15 @@ VARYING = (
     re.compile(r"()(?=\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|\+00:00))"),
     re.compile(r"()(?=\d{4}-\d\d-\d\d$)"),
     re.compile(r"^()(?=[0-9a-f]{8}  )"),
+    # Bytes of a release and checksums of an image: the last digits of computed numbers in them
+    # depend on the processor (docs/decisions.md).
+    re.compile(r"^(?:new )?bytes +()(?=[1-9][\d,]*$)"),
+    re.compile(r"\b()(?=0x[0-9a-f]{8}\b)"),
     # Random keys, and digests, in which the versions of libraries are.
-    re.compile(r"\b()(?=[0-9a-f]{64}\b|[0-9a-f]{16}\b)(?!\d+\b)"),
+    re.compile(r"(?<![\w.])()(?=[0-9a-f]{64}\b|[0-9a-f]{16}\b)(?!\d+\b)"),
 )
 """Places in a line of an output before which ``~`` marks a figure that varies."""
+DIGEST = re.compile(r"~[0-9a-f]{16}")
 
 
 @dataclass(frozen=True)
@@ -287,9 +292,17 @@ def shortened(printed: Sequence[str], shown: Sequence[str]) -> list[str]:
 
 
 def rewritten(page: str, outputs: Iterable[Sequence[str]]) -> str:
-    """Return a page with the outputs of its steps; equal outputs stay as they are."""
-    for step, printed in reversed(list(zip(steps_of(page), outputs, strict=True))):
-        if difference(step.shown, printed) is None:
+    """Return a page with the outputs of its steps; equal outputs stay as they are.
+
+    If any output of a page differs, those with digests are rewritten too, so that a digest is the
+    same in all outputs.
+    """
+    pairs = list(zip(steps_of(page), outputs, strict=True))
+    is_equal = [difference(step.shown, printed) is None for step, printed in pairs]
+    if all(is_equal):
+        return page
+    for (step, printed), is_kept in reversed(list(zip(pairs, is_equal, strict=True))):
+        if is_kept and not any(map(DIGEST.search, step.shown)):
             continue
         text = "".join(f"{line}\n" for line in shortened(printed, step.shown))
         if step.is_python:

@@ -33,13 +33,14 @@ lost = connection.sql(
 print(lost.to_table())
 
 # %% [markdown]
-# Close pairs: each guide star and its nearest rejected neighbour within a minute of arc.
+# Close pairs: guide stars and the stars within a minute of arc that are too faint for the database.
+# The camera sees both as one spot.
 
 # %%
 pairs = connection.sql(
-    "SELECT a_designation, b_designation, b_reason, separation_arcsec "
-    "FROM crossmatch('gaia_12deg.stars', 'gaia_12deg.rejected', 60, nearest := true) "
-    "ORDER BY separation_arcsec LIMIT 5"
+    "SELECT a_designation, a_mag, b_mag, separation_arcsec "
+    "FROM crossmatch('gaia_12deg.stars', 'gaia_12deg.rejected', 60) "
+    "WHERE b_reason = 'too_faint' ORDER BY separation_arcsec LIMIT 5"
 )
 print(pairs.to_table())
 connection.close()

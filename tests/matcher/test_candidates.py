@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,13 +24,23 @@ def weak(sky):
     return frames_of(sky, 40, WEAK)
 
 
+@pytest.fixture(scope="module")
+def answers(sky, weak):
+    """The answers of a matcher with the usual limit, by engine."""
+
+    @cache
+    def of(engine):
+        matcher = Matcher(sky, engine=engine, **STATED)
+        return [matcher.identify(frame.centroids_px, mag=frame.mag) for frame in weak]
+
+    return of
+
+
 @both_engines
-def test_a_higher_limit_accepts_the_candidate_and_changes_nothing_else(sky, weak, engine):
-    strict = Matcher(sky, engine=engine, **STATED)
+def test_a_higher_limit_accepts_the_candidate_and_changes_nothing_else(sky, weak, answers, engine):
     loose = Matcher(sky, engine=engine, max_false_match_probability=1e-2, **STATED)
     counts = {"answered": 0, "candidates": 0, "none": 0}
-    for frame in weak:
-        found = strict.identify(frame.centroids_px, mag=frame.mag)
+    for frame, found in zip(weak, answers(engine), strict=True):
         other = loose.identify(frame.centroids_px, mag=frame.mag)
         if found.ok:
             assert found.refusal is None
@@ -55,11 +66,10 @@ def test_a_higher_limit_accepts_the_candidate_and_changes_nothing_else(sky, weak
 
 
 @needs_c
-def test_both_engines_have_the_same_candidates(sky, weak):
-    numpy, c = (Matcher(sky, engine=engine, **STATED) for engine in ENGINES)
+def test_both_engines_have_the_same_candidates(answers):
     compared = 0
-    for frame in weak:
-        one, other = (m.identify(frame.centroids_px, mag=frame.mag).refusal for m in (numpy, c))
+    for pair in zip(*map(answers, ENGINES), strict=True):
+        one, other = (answer.refusal for answer in pair)
         assert (one is None) == (other is None)
         if one is None:
             continue
@@ -73,10 +83,13 @@ def test_both_engines_have_the_same_candidates(sky, weak):
 
 
 @both_engines
-def test_a_candidate_is_of_the_whole_frame(sky, weak, engine):
+def test_a_candidate_is_of_the_whole_frame(sky, weak, answers, engine):
     matcher = Matcher(sky, engine=engine, **STATED)
-    frame = next(one for one in weak if _candidate(matcher, one) is not None)
-    before = _candidate(matcher, frame)
+    frame, before = next(
+        (frame, answer.refusal.candidate)
+        for frame, answer in zip(weak, answers(engine), strict=True)
+        if has_candidate(answer)
+    )
     # A centroid outside of the frame, and one that is no number.
     px = np.vstack([[[-5.0, 3.0]], frame.centroids_px, [[np.nan, 1.0]]])
     mag = np.concatenate([[5.0], frame.mag, [5.0]])
@@ -95,13 +108,8 @@ def test_a_candidate_is_of_the_whole_frame(sky, weak, engine):
 
 
 @both_engines
-def test_the_json_of_a_refusal_has_its_candidate(sky, weak, engine):
-    matcher = Matcher(sky, engine=engine, **STATED)
-    found = next(
-        one for frame in weak
-        if (one := matcher.identify(frame.centroids_px, mag=frame.mag)).refusal is not None
-        and one.refusal.candidate is not None
-    )  # fmt: skip
+def test_the_json_of_a_refusal_has_its_candidate(answers, engine):
+    found = next(filter(has_candidate, answers(engine)))
     content = json.loads(json.dumps(found.to_dict()))
     told, candidate = content["refusal"]["candidate"], found.refusal.candidate
     assert content["status"] == "no_match"
@@ -122,6 +130,5 @@ def test_a_frame_without_sky_has_no_likely_candidate(sky, engine):
     assert matcher.identify(np.zeros((2, 2))).refusal.candidate is None
 
 
-def _candidate(matcher, frame):
-    why = matcher.identify(frame.centroids_px, mag=frame.mag).refusal
-    return None if why is None else why.candidate
+def has_candidate(answer):
+    return answer.refusal is not None and answer.refusal.candidate is not None

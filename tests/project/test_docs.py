@@ -135,8 +135,13 @@ def test_figures_that_vary_get_a_mark():
     assert rate.endswith("  0  ~4.9")
     [key] = page_outputs.marked(f"root  anna {16 * 'a'}  1  2036-11-25")
     assert key == f"root  anna ~{16 * 'a'}  1  ~2036-11-25"
-    [star] = page_outputs.marked("Gaia DR3 1575017391376658")
-    assert "~" not in star
+    assert page_outputs.marked("new bytes  25,006,142\nnew bytes  0\ncrc 0x809d2270") == [
+        "new bytes  ~25,006,142",
+        "new bytes  0",
+        "crc ~0x809d2270",
+    ]
+    for figure in ("Gaia DR3 1575017391376658", "separation 2.317810950862069e-07"):
+        assert page_outputs.marked(figure) == [figure]
     long = "warning: " + 40 * "many words "
     assert max(map(len, page_outputs.marked(long))) <= page_outputs.MAX_WIDTH
 
@@ -169,6 +174,11 @@ def test_the_outputs_of_a_page_are_run_and_rewritten(tmp_path):
     assert "$ echo one \\\n  two\none two\n$ true\n```" in written
     assert "print(math.e)\n```\n\n```text\n2.718281828459045\n```\n" in written
     assert page_outputs.rewritten(written, outputs) == written
+    first, second = f"key ~{16 * 'a'}", f"key ~{16 * 'b'}"
+    shown = page_outputs.rewritten(PAGE, [["~2 s"], [first], *outputs[2:]])
+    assert page_outputs.rewritten(shown, [["~3 s"], [second], *outputs[2:]]) == shown
+    newer = page_outputs.rewritten(shown, [["~3 s"], [second], ["3.2"], *outputs[3:]])
+    assert f"\n~2 s\n$ true\n{second}\n" in newer
     assert PAGE.replace("old\n", "one two\n") != written
     with pytest.raises(RuntimeError, match="nothing-of-this-name"):
         page_outputs.run_page("```console\n$ nothing-of-this-name\n```\n", tmp_path, {})

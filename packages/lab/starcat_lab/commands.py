@@ -205,7 +205,7 @@ def print_evaluation(evaluation: Evaluation, *, as_json: bool) -> None:
 
 def _print_tables(contents: Sequence[Mapping[str, Any]]) -> None:
     from starcat_lab.report import tables as report_tables
-    from starcat_lab.report.files import legend
+    from starcat_lab.report.files import legend, rules_of
 
     for content in contents:
         failed = report_tables.failure_table(content)
@@ -220,6 +220,8 @@ def _print_tables(contents: Sequence[Mapping[str, Any]]) -> None:
         _print(summary)
     for head, meaning in legend(contents):
         say(f"{head}: {meaning}")
+    for rule, meaning in rules_of(contents):
+        say(f"success by the rule {rule}: {meaning}")
 
 
 def _print(table: ReportTable, prefix: str = "") -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from starcat.arrays import Array, Mask, Rows
-from starcat.errors import CalibrationError, ConfigError
+from starcat.errors import CalibrationError, ConfigError, count_of
 from starcat.frames.calibration.fit import Fit, Seen, camera_of, project, values_of
 from starcat.frames.calibration.rounds import supported_fit
 from starcat.frames.images.solve_files import FrameAnswer, LocalInputs, identify_either_way
@@ -80,8 +80,7 @@ class FirstCamera:
         named = ", ".join(self.names[:5]) + (", ..." if count > 5 else "")
         seen = f"{'at least ' if self.is_deeper else ''}{self.reach_mag:.2f}"
         lines = [
-            f"From {self.n_files} pictures or files of centroids, {count} of them identified: "
-            f"{named}.",
+            f"From {count_of(self.n_files, 'file')}, {count} identified: {named}.",
             f"camera.fov_x_deg = {self.camera.fov_x_deg:.4f} +- {self.fov_error_deg:.4f}: of a "
             "lens without distortion, from the stars of the pictures.",
             f"Stars of {band} = {seen} are seen half as often as bright ones "
