@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from starcat.frames.planning.choice import StageOfLimits
     from starcat.frames.planning.plan import plan
     from starcat.frames.planning.plan_result import Expected, Plan
-    from starcat.frames.sky.in_time import BodyInFrame, SkyInTime, identify_in_time, sky_in_time
+    from starcat.frames.sky.in_time import BodyInFrame, SkyInTime, sky_in_time, with_planets
     from starcat.frames.sky.observer import Observer
     from starcat.geometry.camera import Camera
     from starcat.geometry.distortion import Distortion
@@ -117,7 +117,6 @@ __all__ = [
     "diff",
     "export",
     "identify_file",
-    "identify_in_time",
     "ingest",
     "init",
     "learn",
@@ -131,6 +130,7 @@ __all__ = [
     "simulate",
     "sky_in_time",
     "verify",
+    "with_planets",
 ]
 
 _HOMES = {
@@ -183,7 +183,6 @@ _HOMES = {
     "diff": ("starcat.database.diff", "diff"),
     "export": ("starcat.ship.exchange.export", "export"),
     "identify_file": ("starcat.frames.images.solve_files", "identify_file"),
-    "identify_in_time": ("starcat.frames.sky.in_time", "identify_in_time"),
     "ingest": ("starcat.catalog.store.reading", "ingest"),
     "init": ("starcat.pipeline.starter", "init"),
     "learn": ("starcat.frames.calibration.learn", "learn"),
@@ -197,6 +196,7 @@ _HOMES = {
     "simulate": ("starcat.pipeline.simulation.simulate", "simulate"),
     "sky_in_time": ("starcat.frames.sky.in_time", "sky_in_time"),
     "verify": ("starcat.database.verify", "verify"),
+    "with_planets": ("starcat.frames.sky.in_time", "with_planets"),
 }
 """Module that defines each public name, and its name there."""
 

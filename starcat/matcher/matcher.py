@@ -239,27 +239,19 @@ class Matcher:
                 "read its frames with starcat.read_frames"
             )
         values: Any = centroids_px
+        remarks: tuple[str, ...] = ()
         if type(values) is not np.ndarray or values.dtype.names:
             values = frame_of_table(values)
-            if remarks := remarks_of(values):
-                answer = self.identify(
-                    values.centroids_px, camera, mag=values.mag if mag is None else mag,
-                    sigma_px=values.sigma_px if sigma_px is None else sigma_px, fov_error=fov_error,
-                    prior=prior, prior_error_deg=prior_error_deg, fov_deg=fov_deg, explain=explain,
-                )  # fmt: skip
-                return answer.with_facts(frame_remarks=remarks)
-        camera, near = self._camera(camera), prior_of(prior, prior_error_deg)
+            remarks = remarks_of(values)
+        camera, expected = self._camera(camera), prior_of(prior, prior_error_deg)
         if fov_deg is not None:
-            fov_deg = self.checked_field(fov_deg, fov_error, near)
+            fov_deg = self.checked_field(fov_deg, fov_error, expected)
             if not isinstance(fov_deg, tuple):
                 size_px = camera.width_px, camera.height_px
                 camera, fov_deg = Camera(*size_px, fov_x_deg=fov_deg), None
         fov_error = 0.0 if fov_error is None else fov_error
         px, mags, sigma = as_arrays(values, mag, sigma_px)
-        if near is not None and isinstance(near, BoresightPrior):
-            answer = self.identify(px, camera, mag=mags, sigma_px=sigma, fov_error=fov_error,
-                                  fov_deg=fov_deg)  # fmt: skip
-            return near.checked(answer)
+        near = expected if isinstance(expected, Prior) else None
         if len(px) <= MAX_CENTROIDS:
             answer = self._search(px, camera, mags, sigma, fov_error, near, fov_deg)
         else:
@@ -276,11 +268,15 @@ class Matcher:
                     px[rows], camera, mag_of_rows, sigma_of_rows, fov_error, None, None
                 )
                 answer = with_second_attitude(answer, rows, other)
-        if not explain or answer.status != "no_match" or near is not None or fov_deg is not None:
-            return answer
-        return self._explained(
-            answer, MeasuredFrame("", px, mags, sigma_px=sigma), camera, fov_error
-        )
+        if isinstance(expected, BoresightPrior):
+            answer = expected.checked(answer)
+        elif explain and answer.status == "no_match" and near is None and fov_deg is None:
+            answer = explained(
+                answer, MeasuredFrame("", px, mags, sigma_px=sigma), camera, self._search_other,
+                fov_error=fov_error, with_fields=self.settings.method in SCALE_FREE,
+                limit=self.settings.max_false_match_probability,
+            )  # fmt: skip
+        return answer.with_facts(frame_remarks=remarks) if remarks else answer
 
     def checked_field(
         self, fov_deg: Any, fov_error: float | None, near: Prior | BoresightPrior | None
@@ -298,15 +294,6 @@ class Matcher:
                     hint=f"give either {{fov_deg}} or {{{name}}}",
                 )
         return fields_deg
-
-    def _explained(
-        self, refused: MatchResult, frame: MeasuredFrame, camera: Camera, fov_error: float
-    ) -> MatchResult:
-        return explained(
-            refused, frame, camera, self._search_other, fov_error=fov_error,
-            with_fields=self.settings.method in SCALE_FREE,
-            limit=self.settings.max_false_match_probability,
-        )  # fmt: skip
 
     def _search_other(
         self, frame: MeasuredFrame, fov_error: float, camera: Camera, time_limit_s: float

@@ -34,12 +34,16 @@ from starcat.matcher.shape import (
     NO_SHAPE,
     Shape,
     derivatives,
+    half_ranges,
     solve_normal,
     undone_px,
 )
 
 _SCALINGS = 2
 """Rounds that find the scale of a few stars. The second corrects for angles taken as tangents."""
+
+_STEPS_OF_SHAPE = 3
+"""Steps of a fit that begins within some pixels of its end; the second is exact to 1e-6 px."""
 
 MIN_WEIGHT = 1e-8
 """Least weight of a centroid over the largest of its frame; rounding errors exclude lower ones."""
@@ -183,11 +187,15 @@ def after_step(pose: Pose, step: Array, observation: Observation) -> Pose | None
     terms[:free] += step[3:]
     if np.abs(terms).max() > LARGEST_TERM:
         return None
-    x, y, z = (-step[:3]).tolist()  # directions turn against the camera
+    return pose_of_shape(_turned(pose.matrix, step), Shape(terms, free), observation)
+
+
+def _turned(matrix: Matrix, step: Array) -> Matrix:
+    """Return an attitude after the turn of a step of a fit: directions turn against the camera."""
+    x, y, z = (-step[:3]).tolist()
     turn: Turn = x, y, z
-    q = after_turn(quaternion_from_matrix(pose.matrix).tolist(), turn)
-    matrix = matrix_from_quaternion(np.array(list(q)))
-    return pose_of_shape(matrix, Shape(terms, free), observation)
+    q = after_turn(quaternion_from_matrix(matrix).tolist(), turn)
+    return matrix_from_quaternion(np.array(list(q)))
 
 
 def pose_of_shape(matrix: Matrix, shape: Shape, observation: Observation) -> Pose:
@@ -220,6 +228,29 @@ def fit_by_weights(seen: Directions, stars: Directions, sigma_px: Array) -> tupl
     matrix = solve_wahba_svd(seen, stars, weights_of(sigma_px))
     difference = seen - stars @ matrix.T
     return matrix, math.sqrt(float(np.vdot(difference, difference)) / len(seen))
+
+
+def fit_shape_by_weights(
+    px: Pixels, stars: Directions, sigma_px: Array, matrix: Matrix, camera: Camera, shape: Shape
+) -> tuple[Matrix, float]:
+    """Return the attitude that fits centroids best with their shape, and its residual, radians.
+
+    The fit begins with an attitude and a shape that are nearly right. No range limits its terms.
+    """
+    weight = np.sqrt(weights_of(sigma_px))[:, None]
+    terms = shape.terms.copy()
+    for _ in range(_STEPS_OF_SHAPE):
+        places_px = undone_px(px, terms, camera)
+        body = camera.directions_from_pixels(places_px)
+        residual_px = places_px - camera.pixels_from_directions(stars @ matrix.T)
+        rows = derivatives(px, body, camera, shape.free) * weight[..., None]
+        normal = solve_normal(residual_px * weight, rows, terms, half_ranges(0.0), 0.0)
+        if normal is None:
+            break
+        matrix = _turned(matrix, normal.step)
+        terms[: shape.free] += normal.step[3:]
+    seen = camera.directions_from_pixels(undone_px(px, terms, camera))
+    return fit_by_weights(seen, stars, sigma_px)
 
 
 def _by_scale(body: Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from html import escape
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcat.arguments import wrong_type
-from starcat.arrays import Matrix
+from starcat.arrays import Array, Directions, Matrix, Pixels
 from starcat.database.onboard.flight_limits import centroids_in_flight
 from starcat.errors import ConfigError, NotIdentifiedError, count_of
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
@@ -30,7 +31,7 @@ from starcat.matcher.observation import (
     is_frame,
     remarks_on_pixels,
 )
-from starcat.matcher.pose import fit_by_weights
+from starcat.matcher.pose import fit_by_weights, fit_shape_by_weights
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.shape import Shape, half_ranges, undone_px
 from starcat.matcher.stars import (
@@ -254,16 +255,9 @@ class MatchResult:
         """The centroids that are stars, one row each; empty unless identified."""
         if not self.ok:
             return NO_STARS
-        if self.frame is None or self.database is None or self.camera is None:
-            raise ConfigError("this MatchResult does not hold the frame that was asked about")
+        frame, camera, database = self.searched
         return matched_stars(
-            self.star_index,
-            self.matrix,
-            self.camera,
-            self.frame,
-            self.database,
-            self.noise_px,
-            self.shape,
+            self.star_index, self.matrix, camera, frame, database, self.noise_px, self.shape
         )
 
     @cached_property
@@ -406,28 +400,73 @@ class MatchResult:
         MatchResult
             Of a frame that was identified: the same stars, another attitude and covariance.
         """
-        stars = self.stars
-        if self.frame is None or self.database is None or self.camera is None:
-            raise ConfigError("this MatchResult does not hold the frame that was asked about")
-        _, _, sigma = as_arrays(self.frame.centroids_px, sigma_px=sigma_px)
+        frame, _, _ = self.searched
+        _, _, sigma = as_arrays(frame.centroids_px, sigma_px=sigma_px)
         if sigma is None:
             raise ConfigError(
                 "missing", parameter="sigma_px", hint="give the noise of each centroid"
             )
-        px = np.column_stack([stars.x_px, stars.y_px])
-        if self.shape is not None:
-            px = undone_px(px, self.shape.terms, self.camera)
-        matrix, residual_rad = fit_by_weights(
-            self.camera.directions_from_pixels(px),
-            self.database.directions[stars.star_index],
-            sigma[stars.spot],
-        )
-        return replace(
-            self,
-            matrix=matrix,
-            residual_arcsec=residual_rad * ARCSEC,
-            frame=replace(self.frame, sigma_px=sigma),
-        )
+        return replace(self, frame=replace(frame, sigma_px=sigma))._fitted()
+
+    def without_stars(self, reasons: Mapping[int, str]) -> MatchResult:
+        """Return the answer without the stars of some centroids.
+
+        Parameters
+        ----------
+        reasons : mapping of int to str
+            Rows of centroids that are no stars, and what they are instead: the reason in `dropped`.
+
+        Returns
+        -------
+        MatchResult
+            Of a frame that was identified. The attitude is fitted again if a centroid had a star.
+            ``false_match_probability`` stays: it is that of the agreement that was accepted.
+        """
+        star_index = self.star_index.copy()
+        star_index[list(reasons)] = -1
+        dropped = tuple(sorted((dict(self.dropped) | dict(reasons)).items()))
+        answer = replace(self, star_index=star_index, dropped=dropped)
+        return answer if answer.n_matched == self.n_matched else answer._fitted()
+
+    def _fitted(self) -> MatchResult:
+        """Return the answer with the attitude that fits its stars best, its shape as it is."""
+        frame, camera, database = self.searched
+        rows = np.flatnonzero(self.star_index >= 0)
+        seen = camera.directions_from_pixels(self.unshaped_px[rows])
+        stars = database.directions[self.star_index[rows]]
+        matrix, residual_rad = fit_by_weights(seen, stars, _noise_of(frame)[rows])
+        return self.with_facts(matrix=matrix, residual_arcsec=residual_rad * ARCSEC)
+
+    def attitude_of(self, directions: Directions) -> tuple[Matrix, float]:
+        """Return the attitude that fits directions of the stars best, and its residual in radians.
+
+        ``directions`` are those of the centroids with a star, shape (n, 3), in their order. The
+        centroids are weighted by their noise where it was stated. If the frame has a shape, it is
+        fitted again with the attitude.
+        """
+        frame, camera, _ = self.searched
+        rows = np.flatnonzero(self.star_index >= 0)
+        px, sigma_px = frame.centroids_px[rows], _noise_of(frame)[rows]
+        if self.shape is None:
+            return fit_by_weights(camera.directions_from_pixels(px), directions, sigma_px)
+        return fit_shape_by_weights(px, directions, sigma_px, self.matrix, camera, self.shape)
+
+    @property
+    def unshaped_px(self) -> Pixels:
+        """Places of the centroids that the camera would give without the frame's shape, (N, 2)."""
+        frame, camera, _ = self.searched
+        px = frame.centroids_px
+        return px if self.shape is None else undone_px(px, self.shape.terms, camera)
+
+    @property
+    def searched(self) -> tuple[Frame, Camera, MatcherDatabase]:
+        """The frame, the camera and the database of an answer.
+
+        `ConfigError` unless identified, or if the result does not hold them, as after pickling.
+        """
+        if self.frame is None or self.camera is None or self.database is None:
+            raise ConfigError("this MatchResult does not hold the frame that was asked about")
+        return self.frame, self.camera, self.database
 
     def rotation(self) -> Rotation:
         """Return the attitude as a scipy rotation: ``rotation().apply(v_icrs)`` is ``v_body``.
@@ -455,7 +494,7 @@ class MatchResult:
         ----------
         frame : frame, optional
             The frame to list in ``stars``, with as many centroids; by default the frame that was
-            searched. A frame in which planets were found was searched without their centroids.
+            searched.
 
         Returns
         -------
@@ -756,3 +795,8 @@ def no_match(
         refusal=refusal,
         **facts,
     )
+
+
+def _noise_of(frame: Frame) -> Array:
+    """Return the noise of the centroids of a frame, the same for all if it is not stated."""
+    return np.ones(len(frame)) if frame.sigma_px is None else frame.sigma_px

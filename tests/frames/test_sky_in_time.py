@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
@@ -27,9 +28,9 @@ from starcat.frames.images.solve_files import FileAnswers, LocalInputs, Measured
 from starcat.frames.sky.bodies import PHASE_CURVES, apparent_magnitude, bodies_seen
 from starcat.frames.sky.in_time import (
     earth_limb_angle_deg,
-    identify_in_time,
     planets_among,
     sky_in_time,
+    with_planets,
 )
 from starcat.frames.sky.observer import AU_KM, LIGHT_KM_S, Observer, aberrated, observer_numbers
 from starcat.geometry import attitude
@@ -262,8 +263,7 @@ def identified(
     sky: MatcherDatabase, frame: Array, observer: Observer, magnitudes: Array | None = None
 ) -> MatchResult:
     """The answer to a frame that can contain planets."""
-    identify = Matcher(sky).identify
-    return identify_in_time(identify, sky, frame, sky.camera, observer, mag=magnitudes)
+    return with_planets(Matcher(sky).identify(frame, mag=magnitudes), observer)
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +280,7 @@ def test_the_attitude_is_right_to_a_milliarcsecond(random_sky, orbit):
         frame, rows = apparent_frame(random_sky, matrix, camera, time, orbit)
         found = identified(random_sky, frame, observer)
         assert (found.star_index == rows).mean() > 0.9
-        sky = sky_in_time(found, random_sky, frame, camera, observer)
+        sky = sky_in_time(found, observer)
         assert sky is not None
         assert apart_mas(matrix_from_quaternion(sky.q_body_from_icrs), matrix) < 1.0
         assert sky.residual_arcsec < 0.002
@@ -288,7 +288,7 @@ def test_the_attitude_is_right_to_a_milliarcsecond(random_sky, orbit):
         correction_mas = apart_mas(uncorrected, matrix)
         assert sky.correction_arcsec == pytest.approx(correction_mas / 1000.0, abs=0.002)
     found = identified(random_sky, frame[:1], observer)
-    assert sky_in_time(found, random_sky, frame[:1], camera, observer) is None
+    assert sky_in_time(found, observer) is None
 
 
 @pytest.mark.parametrize(
@@ -326,13 +326,12 @@ def jupiter_frame(random_sky) -> tuple[Array, Array, NDArray[np.int64], Array]:
 
 def test_jupiter_is_named_and_is_no_star(random_sky, jupiter_frame, capsys):
     frame, mag, rows, matrix = jupiter_frame
-    observer, camera = Observer.at(JUPITER), random_sky.camera
-    last = len(frame) - 1
+    observer, last = Observer.at(JUPITER), len(frame) - 1
     found = identified(random_sky, frame, observer, mag)
     assert (last, "jupiter") in found.dropped
     assert found.star_ids[last] == -1
     assert (found.star_index[:last] == rows[:last]).mean() > 0.9
-    sky = sky_in_time(found, random_sky, frame, camera, observer)
+    sky = sky_in_time(found, observer)
     assert sky is not None
     jupiter = next(body for body in sky.bodies if body.name == "Jupiter")
     assert jupiter.row == last
@@ -368,42 +367,41 @@ def test_a_star_beside_jupiter_does_not_take_its_spot(random_sky, jupiter_frame)
         np.append(random_sky.mag, 5.9), np.full(len(directions), b""), random_sky.products,
     )  # fmt: skip
     matcher = Matcher(database, engine="numpy")
-    assert matcher.identify(frame, camera, mag=mag).star_ids[-1] == len(directions) - 1
-    found = identify_in_time(matcher.identify, database, frame, camera, observer, mag=mag)
+    plain = matcher.identify(frame, camera, mag=mag)
+    assert plain.star_ids[-1] == len(directions) - 1
+    found = with_planets(plain, observer)
     assert found.star_ids[-1] == -1
     assert found.dropped == ((len(frame) - 1, "jupiter"),)
+    # The star half a pixel from its spot no longer turns the attitude.
+    without = matcher.identify(frame[:-1], camera, mag=mag[:-1])
+    off, before = (apart_mas(each.matrix, without.matrix) for each in (found, plain))
+    assert off < 0.5 * before
     # A star that outshines the planet keeps its spot.
     database.mag[-1] = -3.0
-    found = identify_in_time(matcher.identify, database, frame, camera, observer, mag=mag)
-    assert found.star_ids[-1] == len(directions) - 1
+    assert with_planets(plain, observer).star_ids[-1] == len(directions) - 1
 
 
-def test_a_frame_that_jupiter_spoils_is_asked_again_without_it(random_sky, jupiter_frame):
-    frame, mag, rows, _ = jupiter_frame
-    camera, last = random_sky.camera, len(frame) - 1
-    matcher, asked = Matcher(random_sky), []
+def test_a_frame_of_another_shape_is_corrected_in_its_shape(random_sky, jupiter_frame):
+    # The rows are stretched by 2 %: Jupiter has moved by some pixels with the stars.
+    frame, mag, _, matrix = jupiter_frame
+    middle_px = random_sky.camera.middle_px
+    stretched = middle_px + (frame - middle_px) * [1.0, 1.02]
+    found = identified(random_sky, stretched, Observer.at(JUPITER), mag)
+    assert found.shape is not None
+    assert (len(frame) - 1, "jupiter") in found.dropped
+    sky = sky_in_time(found, Observer.at(JUPITER))
+    assert sky is not None
+    assert apart_mas(matrix_from_quaternion(sky.q_body_from_icrs), matrix) < 1000.0
+    assert sky.residual_arcsec == pytest.approx(found.residual_arcsec, abs=0.5)
 
-    def stubborn(centroids: Array, mag: Array | None = None) -> Any:
-        """Refuse frames whose brightest spot is not a star, as a stricter matcher does."""
-        asked.append(centroids)
-        keep = len(frame) if np.isnan(centroids[last]).all() else 2
-        mags = None if mag is None else mag[:keep]
-        return matcher.identify(centroids[:keep], camera, mag=mags)
 
-    at = Observer.at(JUPITER)
-    found = identify_in_time(stubborn, random_sky, frame, camera, at, mag=mag)
-    assert found.status == "identified"
-    assert (last, "jupiter") in found.dropped
-    assert (found.star_index[:last] == rows[:last]).mean() > 0.9
-    plain = matcher.identify(frame[:-1], camera, mag=mag[:-1])
-    assert found.false_match_probability > plain.false_match_probability
-    # At another time no planet is there, and leaving spots out is no way to an answer.
-    other = Observer.at("2031-01-10T09:00:00")
-    assert not identify_in_time(stubborn, random_sky, frame, camera, other, mag=mag).ok
-    # Without brightness it is unknown which spots to leave out.
-    before = len(asked)
-    identify_in_time(stubborn, random_sky, frame, camera, at)
-    assert len(asked) == before + 1
+def test_an_answer_without_its_frame_says_so(random_sky, jupiter_frame):
+    frame, mag, _, _ = jupiter_frame
+    observer = Observer.at(JUPITER)
+    alone = pickle.loads(pickle.dumps(identified(random_sky, frame, observer, mag)))
+    for function in (with_planets, sky_in_time):
+        with pytest.raises(ConfigError, match="does not hold the frame"):
+            function(alone, observer)
 
 
 def test_the_earth_and_the_moon_do_not_take_the_spot_of_a_planet(random_sky, jupiter_frame):

@@ -134,9 +134,8 @@ def test_what_starcat_opens_its_functions_take(small_database, tmp_path):
         ]
     [frame] = starcat.simulate(opened, seed=7)
     observer = starcat.Observer.at(TIME)
-    asked = opened, frame, matcher.database.camera, observer
-    found = starcat.identify_in_time(matcher.identify, *asked)
-    assert starcat.sky_in_time(found, *asked)
+    answer = starcat.with_planets(matcher.identify(frame), observer)
+    assert starcat.sky_in_time(answer, observer)
 
 
 class Other:
@@ -179,10 +178,10 @@ WRONG = [
     lambda db: starcat.export(db, "hats", max_partition_rows="x"),
     lambda db: starcat.export(db, "onboard", max_bytes="x"),
     lambda db: starcat.export(db, "onboard", sign=5),
-    lambda db: starcat.identify_in_time(Other(), Other(), [[1, 2]], None, None),
-    lambda db: starcat.identify_in_time(print, db, [[1, 2]], Other(), starcat.Observer.at(TIME)),
-    lambda db: starcat.identify_in_time(print, db, [[1, 2]], starcat.Camera(9, 9, 9.0), Other()),
-    lambda db: starcat.sky_in_time(None, db, [[1, 2]], starcat.Camera(9, 9, 9.0), Other()),
+    lambda db: starcat.with_planets(Other(), starcat.Observer.at(TIME)),
+    lambda db: starcat.with_planets(starcat.Matcher.open(db).identify([[1, 2]]), Other()),
+    lambda db: starcat.sky_in_time(None, starcat.Observer.at(TIME)),
+    lambda db: starcat.sky_in_time(starcat.Matcher.open(db).identify([[1, 2]]), Other()),
     lambda db: starcat.ingest(Other()),
     lambda db: starcat.ingest("sao", Other()),
     lambda db: starcat.ingest("sao", epoch_jyear="soon"),

@@ -31,10 +31,9 @@ PUBLIC = [
     "MeasuredFrame", "Observer", "Plan", "Published", "Pulled", "QueryResult", "Refusal",
     "Settings", "SimulatedFrame", "SkyInTime", "StageOfLimits", "StarcatError", "Starter",
     "Tracker", "Trial", "TriangleOrder", "Verification", "__version__", "build", "calibrate",
-    "connect", "diff", "export", "identify_file", "identify_in_time",
-    "ingest", "init", "learn", "open", "plan",
+    "connect", "diff", "export", "identify_file", "ingest", "init", "learn", "open", "plan",
     "preset", "publish", "pull", "read_frames", "read_spec", "simulate", "sky_in_time",
-    "verify",
+    "verify", "with_planets",
 ]  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -109,13 +109,11 @@ class FrameAnswer:
     @cached_property
     def sky(self) -> SkyInTime | None:
         """The attitude without aberration, and planets; None without an observer or an answer."""
-        camera, database = self.result.camera, self.result.database
-        if self.observer is None or database is None or camera is None:
+        if self.observer is None:
             return None
         from starcat.frames.sky.in_time import sky_in_time
 
-        centroids_px = self.frame.centroids_px
-        return sky_in_time(self.result, database, centroids_px, camera, self.observer)
+        return sky_in_time(self.result, self.observer)
 
     def content(self) -> Content:
         """Return the answer as ``starcat identify --json`` prints it."""
@@ -156,6 +154,10 @@ class FileAnswers:
             frame = upside_down(measured, self.camera.height_px) if turned else measured
             answer = self._answer(frame, error)
             result = answer.result
+            if self.local.observer is not None:
+                from starcat.frames.sky.in_time import with_planets
+
+                result = with_planets(result, self.local.observer)
             if turned or self.is_image:
                 given_as: GivenAs = "picture" if self.is_image else "upside_down"
                 result = result.with_facts(given_as=given_as)
@@ -300,11 +302,6 @@ class FileAnswers:
 
     def _check_options(self) -> None:
         """Check that the ways in which the frames are searched go together."""
-        if self.local.observer is not None and self.local.track:
-            raise ConfigError(
-                "planets are not separated from stars while frames are tracked",
-                hint="leave out {time} or {track:True}",
-            )
         is_near = self.options.prior_q is not None or self.local.track
         if self.options.fov_deg is not None and is_near:
             raise ConfigError(
@@ -328,20 +325,7 @@ class FileAnswers:
         arguments |= {
             "fov_deg": self.options.fov_deg, "prior": prior, "prior_error_deg": error_deg,
         }  # fmt: skip
-        if self.local.observer is None:
-            return matcher.identify(frame.centroids_px, mag=frame.mag, **arguments)
-        from starcat.frames.sky.in_time import identify_in_time
-
-        return identify_in_time(
-            partial(matcher.identify, **arguments),
-            matcher.database,
-            frame.centroids_px,
-            camera,
-            self.local.observer,
-            mag=frame.mag,
-            tolerance_px=matcher.settings.tolerance_px,
-            max_false_match_probability=matcher.settings.max_false_match_probability,
-        )
+        return matcher.identify(frame.centroids_px, mag=frame.mag, **arguments)
 
     def notes(self, first: FrameAnswer | None) -> list[str]:
         """Return notes for the user in addition to the answers."""

@@ -1,113 +1,74 @@
-"""The sky at a time: what an observer sees, and frames identified with it."""
+"""The sky at a time: planets in an identified frame, and its attitude without aberration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from itertools import combinations
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arguments import check_type, numbers_of, wrong_type
+from starcat.arguments import check_type, numbers_of
 from starcat.arrays import Array, Matrix, Pixels
+from starcat.errors import ConfigError
 from starcat.frames.sky.bodies import RADII_KM, Bodies, bodies_seen
 from starcat.frames.sky.observer import AU_KM, Observer
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
     quaternion_from_matrix,
     radec_roll_from_matrix,
-    solve_wahba_svd,
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
-from starcat.matcher.database import MatcherDatabase, as_database
-from starcat.matcher.observation import FrameLike, as_frame
 from starcat.matcher.result import MatchResult
-from starcat.matcher.settings import CERTAIN, TOLERANCE_PX
-from starcat.resources import PathLike
+from starcat.matcher.settings import NOISE_DEVIATIONS, TOLERANCE_PX
 
 # A body is looked for if it is at most this much fainter than the database's faintest star.
 FAINTER_MAG = 1.0
 
 # A body that is larger, as the Earth is from an orbit, has no spot.
 LARGEST_SPOT_RAD = np.radians(1.0)
-BRIGHTEST = 3  # number of brightest spots that are tried as planets in an unidentified frame
 
 
-def identify_in_time(
-    identify: Callable[..., MatchResult],
-    database: MatcherDatabase | PathLike,
-    centroids_px: FrameLike,
-    camera: Camera,
-    observer: Observer,
-    *,
-    mag: ArrayLike | None = None,
-    tolerance_px: float = TOLERANCE_PX,
-    max_false_match_probability: float = CERTAIN,
-) -> MatchResult:
-    """Identify a frame that can contain planets.
+def with_planets(result: MatchResult, observer: Observer) -> MatchResult:
+    """Return an answer whose spots of planets are named and are no stars.
 
     Parameters
     ----------
-    identify : callable
-        `Matcher.identify`, its camera and options filled in.
-    database, observer : MatcherDatabase (or Database or path), Observer
-        The stars that it names; when and from where the frame was taken.
-    centroids_px, mag : array_like of float64, shape (N, 2) and (N,)
-        Pixels, or a frame or a table as for `Matcher.identify`; magnitudes of any zero point.
-    camera : Camera
-        The camera that took the frame; a focal length that the answer has found counts instead.
-    tolerance_px, max_false_match_probability : float
-        As of `Matcher`; the error of the ephemeris is added to the tolerance of planets.
+    result : MatchResult
+        The answer, with the frame that was searched.
+    observer : Observer
+        When and from where the frame was taken.
 
     Returns
     -------
     MatchResult
-        Spots of planets are in ``dropped``, by the planet's name in small letters. A frame that is
-        not identified is tried again without one or two of its three brightest spots; such an
-        answer counts if planets are there, with the probability of all these searches.
+        Spots of planets are in ``dropped``, by the planet's name in small letters. If a spot had
+        been taken for a fainter star, the attitude is fitted again without it.
 
     Raises
     ------
     TypeError
-        If `identify` is not callable, or `camera` or `observer` have another type.
+        If `result` or `observer` have another type.
     ConfigError
-        If a number is out of range, or the frame cannot be read.
+        If the result does not hold its frame, as after pickling.
     """
-    if not callable(identify):
-        raise wrong_type("identify", identify, "a function, such as Matcher.identify")
-    check_type("camera", camera, Camera, "a starcat.Camera")
+    check_type("result", result, MatchResult, "a MatchResult, as Matcher.identify returns it")
     check_type("observer", observer, Observer, "a starcat.Observer")
-    database = as_database("database", database)
-    observed = as_frame(centroids_px, camera, mag)
-    frame, frame_mag = observed.centroids_px, observed.mag
-    answer = identify(frame, mag=frame_mag)
-
-    def rows_of(result: MatchResult) -> dict[int, str]:
-        if result.status != "identified":
-            return {}
-        eye = result.camera or camera
-        matrix = _apparent_matrix(result, eye, frame, observer)
-        star_mag = np.where(result.star_index >= 0, database.mag[result.star_index], np.nan)
-        return planets_among(
-            frame, matrix, eye, bodies_seen(observer), mag=frame_mag, star_mag=star_mag,
-            tolerance_px=tolerance_px, faint_limit_mag=float(database.mag.max()),
-        )  # fmt: skip
-
-    if answer.status == "identified":
-        names = rows_of(answer)
-        return _without(identify, frame, frame_mag, names) if names else answer
-    for left_out in (questions := _bright_rows(frame_mag)):
-        again = identify(_unset(frame, left_out), mag=frame_mag)
-        names = rows_of(again)
-        chance = again.false_match_probability * (1 + len(questions))
-        if set(left_out) <= set(names) and chance <= max_false_match_probability:
-            again = _without(identify, frame, frame_mag, names)
-            if again.status == "identified":
-                return replace(again, false_match_probability=chance)
-    return answer
+    if not result.ok:
+        return result
+    frame, camera, database = result.searched
+    names = planets_among(
+        result.unshaped_px,
+        _apparent_attitude(result, observer)[0],
+        camera,
+        bodies_seen(observer),
+        mag=frame.mag,
+        star_mag=np.where(result.star_index >= 0, database.mag[result.star_index], np.nan),
+        tolerance_px=NOISE_DEVIATIONS * result.otherwise_px,
+        faint_limit_mag=float(database.mag.max()),
+    )
+    return result.without_stars(names) if names else result
 
 
 def planets_among(
@@ -152,34 +113,14 @@ def planets_among(
     return rows
 
 
-def _apparent_matrix(
-    result: MatchResult, camera: Camera, frame: Array, observer: Observer
-) -> Array:
-    body = camera.directions_from_pixels(frame[np.flatnonzero(result.star_index >= 0)])
-    icrs = body @ matrix_from_quaternion(result.q_body_from_icrs)
-    return solve_wahba_svd(body, observer.apparent(icrs))
-
-
-def _bright_rows(mag: Array | None) -> list[tuple[int, ...]]:
-    if mag is None or not np.isfinite(mag).any():
-        return []
-    rows = np.argsort(np.nan_to_num(mag, nan=np.inf), kind="stable")[:BRIGHTEST].tolist()
-    return [subset for size in (1, 2) for subset in combinations(rows, size)]
-
-
-def _unset(frame: Array, rows: tuple[int, ...]) -> Array:
-    kept = frame.copy()
-    kept[list(rows)] = np.nan
-    return kept
-
-
-def _without(
-    identify: Callable[..., MatchResult], frame: Array, mag: Array | None, names: dict[int, str]
-) -> MatchResult:
-    """Identify a frame without the spots of planets, and name the planets in the answer."""
-    result = identify(_unset(frame, tuple(names)), mag=mag)
-    dropped = tuple((row, names.get(row, reason)) for row, reason in result.dropped)
-    return result.with_facts(dropped=dropped)
+def _apparent_attitude(
+    result: MatchResult, observer: Observer, parallax_mas: Array | None = None
+) -> tuple[Matrix, float]:
+    """Return the attitude by the apparent directions of the stars, and its residual in radians."""
+    stars = result.star_index[result.star_index >= 0]
+    _, _, database = result.searched
+    parallax = None if parallax_mas is None else parallax_mas[stars]
+    return result.attitude_of(observer.apparent(database.directions[stars], parallax))
 
 
 @dataclass(frozen=True)
@@ -256,26 +197,14 @@ class SkyInTime:
 
 
 def sky_in_time(
-    result: MatchResult,
-    database: MatcherDatabase | PathLike,
-    centroids_px: FrameLike,
-    camera: Camera,
-    observer: Observer,
-    *,
-    parallax_mas: ArrayLike | None = None,
+    result: MatchResult, observer: Observer, *, parallax_mas: ArrayLike | None = None
 ) -> SkyInTime | None:
     """Return the results for a frame that need its time.
 
     Parameters
     ----------
     result : MatchResult
-        The answer, best of `starcat.frames.sky.in_time.identify_in_time`.
-    database : MatcherDatabase, Database, str or path-like
-        The stars that it names.
-    centroids_px : array_like of float64, shape (N, 2)
-        The frame.
-    camera : Camera
-        The camera, with the focal length that the frame was identified with.
+        The answer, best of `with_planets`, which names the spots of planets.
     observer : Observer
         When, from where and how fast.
     parallax_mas : array_like of float64, shape (S,), optional
@@ -290,27 +219,27 @@ def sky_in_time(
     Raises
     ------
     TypeError
-        If `result`, `camera` or `observer` have another type.
+        If `result` or `observer` have another type.
     ConfigError
-        If the frame, or the number of parallaxes, does not belong to the answer.
+        If the result does not hold its frame, as after pickling, or the number of parallaxes is
+        not that of the stars.
     """
     check_type("result", result, MatchResult, "a MatchResult, as Matcher.identify returns it")
-    check_type("camera", camera, Camera, "a starcat.Camera")
     check_type("observer", observer, Observer, "a starcat.Observer")
-    if result.status != "identified":
+    if not result.ok:
         return None
-    database = as_database("database", database)
-    frame = as_frame(centroids_px, camera).centroids_px
-    rows = np.flatnonzero(result.star_index >= 0)
-    stars = result.star_index[rows]
+    _, camera, database = result.searched
     parallax = None
     if parallax_mas is not None:
-        parallax = numbers_of("parallax_mas", parallax_mas, "(S,), one per star")[stars]
-    icrs = observer.apparent(database.directions[stars], parallax)
-    body = camera.directions_from_pixels(frame[rows])
-    matrix = solve_wahba_svd(body, icrs)
+        parallax = numbers_of("parallax_mas", parallax_mas, "(S,), one per star")
+        if parallax.shape != database.mag.shape:
+            raise ConfigError(
+                f"shape {parallax.shape}; expected {database.mag.shape}, one per star of "
+                f"{database.name}",
+                parameter="parallax_mas",
+            )
+    matrix, residual_rad = _apparent_attitude(result, observer, parallax)
     before = matrix_from_quaternion(result.q_body_from_icrs)
-    miss = body - icrs @ matrix.T
     ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(matrix)
     seen = bodies_seen(observer)
     angle_deg = np.degrees(separation(seen.directions, matrix[2]))
@@ -321,7 +250,7 @@ def sky_in_time(
         dec_deg,
         roll_deg,
         _angle_arcsec(matrix @ before.T),
-        float(np.degrees(np.sqrt(np.vdot(miss, miss) / len(rows))) * 3600.0),
+        float(np.degrees(residual_rad) * 3600.0),
         _in_frame(seen, matrix, camera, angle_deg, {name: row for row, name in result.dropped}),
         float(angle_deg[seen.row("Sun")]),
         float(angle_deg[seen.row("Moon")]),
