@@ -181,10 +181,11 @@ def test_a_record_of_wds_that_says_nothing(tmp_path, change, reason):
 
 
 def test_fields_of_wds_without_a_value(tmp_path):
-    last, first = {"sep_last": "-1.0"}, {"sep_last": ""}
-    table = read_wds([wds_file(tmp_path, last, first, {"mag_second": "."}, {"mag_first": ""})])
-    assert table.separation_arcsec.tolist() == [5.2, 5.2, 6.1, 6.1]
-    assert np.isnan(table.delta_mag).tolist() == [False, False, True, True]
+    last, first, close = {"sep_last": "-1.0"}, {"sep_last": ""}, {"sep_last": "0.0"}
+    blank = {"mag_second": "."}, {"mag_first": ""}
+    table = read_wds([wds_file(tmp_path, last, first, close, *blank)])
+    assert table.separation_arcsec.tolist() == [5.2, 5.2, 0.0, 6.1, 6.1]
+    assert np.isnan(table.delta_mag).tolist() == [False, False, False, True, True]
 
 
 def test_lines_before_the_first_record_of_wds(tmp_path):
