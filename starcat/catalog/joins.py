@@ -26,8 +26,7 @@ from starcat.catalog.readers.fixed_width import parse_fixed_width
 from starcat.catalog.readers.records import ParsedRecords, number_from_text
 from starcat.catalog.source import RANGES, data_source
 from starcat.catalog.source_files import FileFacts, SourceFiles
-from starcat.catalog.stars.proper_motion import Motion, propagate_directions
-from starcat.catalog.stars.star_table import floats_of
+from starcat.catalog.stars.positions import Positions
 from starcat.catalog.stars.verdict import Reason
 from starcat.geometry.sphere import chord_from_separation
 from starcat.progress import Progress, no_progress
@@ -59,14 +58,10 @@ class Keys:
 
 
 def _same_position(stars: pa.Table, places: Directions) -> tuple[Rows, Rows]:
-    motion = Motion(
-        *(floats_of(stars, name) for name in ("ra_deg", "dec_deg")),
-        *(floats_of(stars, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec")),
-    )
-    _, then = propagate_directions(motion, PLACES_JYEAR - floats_of(stars, "epoch_jyear"))
     rows = np.flatnonzero(np.isfinite(places).all(axis=1))
     if not len(stars) or not len(rows):
         return rows[:0], rows[:0]
+    then = Positions.of(stars).at(PLACES_JYEAR)
     within = float(chord_from_separation(np.radians(MATCH_ARCSEC / 3600.0)))
     chord, star = scipy.spatial.cKDTree(then).query(places[rows], distance_upper_bound=within)
     is_found = np.isfinite(chord)

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.catalog.source import map_of
+from starcat.catalog.stars.positions import Positions
 from starcat.catalog.stars.star_table import rows_of_stars, sort_rows
 from starcat.catalog.store.layout import check_has_columns, is_store, parquet_file
 from starcat.catalog.store.reading import read_catalog
@@ -24,13 +25,14 @@ from starcat.database.products.crossmatch import (
     NUMBERS,
     VERDICTS,
     Crossmatch,
+    Matches,
     candidate_pairs,
     counterparts_of,
     crossmatch,
     matched_rows,
 )
 from starcat.database.writer import Product
-from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
+from starcat.errors import ConfigError, ParseError, SourceMissing
 from starcat.pipeline.draft import Draft, Stage, stage
 from starcat.pipeline.selection.merging import MERGED
 from starcat.pipeline.selection.selecting import Selected
@@ -97,7 +99,8 @@ def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Ta
     apart = pc.not_equal(selected.rejected["reason"], MERGED.name)
     rows = rows_of_stars(selected.rejected.filter(apart), stars)
     others = stars.select(guide_stars.column_names).take(pa.array(np.unique(rows[rows >= 0])))
-    near = candidate_pairs(guide_stars, others, 2.0 * radius_rad)[1]
+    positions = Positions.of(guide_stars), Positions.of(others)
+    near = candidate_pairs(*positions, 2.0 * radius_rad)[1]
     rivals = others.take(pa.array(np.unique(near))).cast(guide_stars.schema)
     return pa.concat_tables([guide_stars, rivals])
 
@@ -120,7 +123,8 @@ def find_counterparts(draft: Draft) -> None:
     tables = []
     for name in options.catalogs:
         _, matches = match_source(name, find_counterparts, both, draft)
-        tables.append(matches.filter(pc.less(matches["star"], len(selected.guide_stars))))
+        is_guide_star = pc.less(matches.table["star"], len(selected.guide_stars))
+        tables.append(matches.table.filter(is_guide_star))
         joined = counterparts_of(tables[-1], name)
         draft.sources[-1] = replace(draft.sources[-1], joined=joined)
     order = product_schema("crossmatch").order
@@ -128,7 +132,7 @@ def find_counterparts(draft: Draft) -> None:
     draft.products.append(Product("crossmatch", table))
 
 
-def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> tuple[pa.Table, pa.Table]:
+def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> tuple[pa.Table, Matches]:
     """Return the stars of a source, read to the depth of the spec, and the candidates for stars.
 
     The draft records the files that were read.
@@ -148,7 +152,7 @@ def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> tuple[p
     facts = SourceFacts(read.source, role, read.files, *counted, rejected, map=table_map)
     draft.sources.append(facts)
     draft.note(by.name, *read.notes)
-    return read.stars, crossmatch(stars, read.stars, options).table
+    return read.stars, crossmatch(stars, read.stars, options)
 
 
 def match_files(a: Path, b: Path, options: Crossmatch) -> tuple[pa.Table, Summary]:
@@ -181,22 +185,5 @@ def read_star_table(path: Path) -> pa.Table:
         names = file.schema_arrow.names
         check_has_columns(path, names, NEEDED, hint)
         table = file.read([*NEEDED, *(name for name in NUMBERS if name in names)])
-    for column in product_schema("stars").columns:
-        if column.name not in table.column_names:
-            continue
-        values, kind = table[column.name], column.arrow_field.type
-        blank = 0 if column.nullable else values.null_count
-        if column.dtype == "float64" and values.type == kind and not column.nullable:
-            blank += pc.sum(pc.invert(pc.is_finite(values))).as_py() or 0
-        if values.type != kind or blank:
-            actual = f"{values.type}" if values.type != kind else f"{blank} rows without a value"
-            raise SchemaError(
-                f"found {actual}; a star table has {kind} in every row",
-                where=f"{path}: {column.name}",
-                product="stars",
-                field=column.name,
-                found=actual,
-                expected=str(kind),
-                hint="Make it with 'starcat ingest'",
-            )
+    product_schema("stars").check_values(table, str(path), hint)
     return table

@@ -41,9 +41,14 @@ from starcat.catalog.stars.star_table import (
     with_columns,
 )
 from starcat.catalog.stars.verdict import Quality, Reason
-from starcat.database.products.crossmatch import Crossmatch, matched_rows
+from starcat.database.products.crossmatch import (
+    Crossmatch,
+    Matches,
+    crossmatch,
+    log_position_densities,
+    matched_rows,
+)
 from starcat.errors import ConfigError
-from starcat.pipeline.counterparts import Summary, match_tables
 
 Rows = NDArray[np.int64]
 
@@ -64,10 +69,9 @@ def merged_catalog(
 def _joined(whole: Ingested, read: Ingested, options: Crossmatch) -> Ingested:
     """Return a catalog with the missing stars added from another catalog."""
     records = _in_band(read, whole.band)
-    matches, summary = match_tables(whole.stars, records, options)
-    pairs = _judged(
-        _Pairs.of(matches, records), whole, replace(read, stars=records), summary, options
-    )
+    matches = crossmatch(whole.stars, records, options)
+    is_elsewhere = _is_elsewhere(matches, options)
+    pairs = _judged(_Pairs.of(matches), is_elsewhere, whole, replace(read, stars=records), options)
     stars, added = _flagged(whole.stars, records, pairs)
     is_kept = np.ones(len(stars), dtype=bool)
     is_kept[pairs.star[pairs.is_replaced]] = False
@@ -114,8 +118,7 @@ class _Pairs:
     record: Rows  # rows of the records
     star_rank: Rows  # of the star among those near the record
     separation_arcsec: Array
-    error_arcsec: Array  # of the separation, each axis
-    delta_mag: Array  # of the record minus the star's; NaN if unknown
+    has_delta_mag: Mask  # whether both magnitudes are known
     is_named: Mask  # whether the record can be the counterpart of the star
     is_ambiguous: Mask
     # What the records are:
@@ -125,27 +128,26 @@ class _Pairs:
     is_replaced: Mask  # the star, whose own record is dubious
 
     @classmethod
-    def of(cls, matches: pa.Table, records: pa.Table) -> _Pairs:
+    def of(cls, matches: Matches) -> _Pairs:
         """Return the pairs of a cross-identification; nothing is judged yet."""
-        number = records["star_id"].to_numpy()  # ascending, each once
-        nothing = np.zeros(len(matches), dtype=bool)
+        table = matches.table
+        nothing = np.zeros(len(table), dtype=bool)
         is_named = nothing.copy()
-        is_named[matched_rows(matches)] = True
+        is_named[matched_rows(table)] = True
         return cls(
-            matches["star"].to_numpy().astype(np.int64),
-            np.searchsorted(number, matches["counterpart_id"].to_numpy()),
-            matches["star_rank"].to_numpy().astype(np.int64),
-            floats_of(matches, "separation_arcsec"),
-            floats_of(matches, "position_error_arcsec"),
-            floats_of(matches, "delta_mag"),
+            table["star"].to_numpy().astype(np.int64),
+            matches.counterpart,
+            table["star_rank"].to_numpy().astype(np.int64),
+            floats_of(table, "separation_arcsec"),
+            np.isfinite(floats_of(table, "delta_mag")),
             is_named,
-            pc.equal(matches["verdict"], "ambiguous").to_numpy(),
+            pc.equal(table["verdict"], "ambiguous").to_numpy(),
             *(nothing for _ in range(4)),
         )
 
 
 def _judged(
-    pairs: _Pairs, whole: Ingested, read: Ingested, summary: Summary, options: Crossmatch
+    pairs: _Pairs, is_elsewhere: Mask, whole: Ingested, read: Ingested, options: Crossmatch
 ) -> _Pairs:
     """Decide what the records near each star are."""
     tables = whole.stars, read.stars
@@ -153,7 +155,7 @@ def _judged(
         (table["quality_flags"].to_numpy() & int(Quality.DUBIOUS_POSITION)) > 0 for table in tables
     ]
     is_dubious = doubted[0][pairs.star], doubted[1][pairs.record]
-    differs = _is_elsewhere(pairs, summary, options) & ~is_dubious[0] & ~is_dubious[1]
+    differs = is_elsewhere & ~is_dubious[0] & ~is_dubious[1]
     # The light of a variable says nothing, and its place is less certain than that of other stars.
     varies = [pc.fill_null(table["is_flagged_variable"], False).to_numpy() for table in tables]
     is_variable = varies[0][pairs.star] | varies[1][pairs.record]
@@ -179,21 +181,23 @@ def _judged(
     )
 
 
-def _is_elsewhere(pairs: _Pairs, summary: Summary, options: Crossmatch) -> Mask:
+def _is_elsewhere(matches: Matches, options: Crossmatch) -> Mask:
     """Return whether the record is rather a companion: its place and its light differ.
 
     The separations of companions are distributed as those of counterparts with a wrong position
     (as many in every factor of the separation), so that the light decides between the two.
     """
-    angle, error = pairs.separation_arcsec, pairs.error_arcsec
-    share = options.outlier_share
-    normal = (1.0 - share) * np.exp(-0.5 * (angle / error) ** 2) / (2.0 * np.pi * error**2)
-    scales = 0.5 + np.log(np.maximum(summary.radius_arcsec / error, 1.0))
-    far = share / (2.0 * np.pi * np.maximum(angle, error) ** 2 * scales)
-    off = (pairs.delta_mag - summary.expected_delta_mag) / options.colour_spread_mag
-    alike = np.exp(-0.5 * off**2) / (options.colour_spread_mag * np.sqrt(2.0 * np.pi))
+    angle, error, delta_mag = (
+        floats_of(matches.table, name)
+        for name in ("separation_arcsec", "position_error_arcsec", "delta_mag")
+    )
+    normal, far = log_position_densities(angle, error, options.radius_arcsec, options.outlier_share)
+    spread = options.colour_spread_mag
+    off = (delta_mag - matches.expected_delta_mag) / spread
+    alike = -0.5 * off**2 - np.log(spread * np.sqrt(2.0 * np.pi))
     with np.errstate(invalid="ignore"):
-        return np.asarray((normal + far) * alike < far / COMPANION_RANGE_MAG)
+        companion = far - np.log(COMPANION_RANGE_MAG)
+        return np.asarray(np.logaddexp(normal, far) + alike < companion)
 
 
 def _light_errors(stars: pa.Table, source: str) -> Array:
@@ -216,7 +220,7 @@ def _parts_of_light(
     counterpart = dict(zip(pairs.star[named].tolist(), np.flatnonzero(named).tolist(), strict=True))
     taken = set(pairs.record[named].tolist())
     is_part = np.zeros(len(named), dtype=bool)
-    rest = np.flatnonzero(~named & np.isfinite(pairs.delta_mag))
+    rest = np.flatnonzero(~named & pairs.has_delta_mag)
     rest = rest[np.lexsort((pairs.record[rest], record_mag[pairs.record[rest]], pairs.star[rest]))]
     so_far: dict[int, float] = {}
     for pair in rest.tolist():

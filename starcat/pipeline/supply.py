@@ -24,7 +24,8 @@ from starcat.catalog.doubles import PairTable, join_pairs
 from starcat.catalog.ingest import UNMOVED
 from starcat.catalog.joins import read_joined
 from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
-from starcat.catalog.stars.proper_motion import Motion, propagate
+from starcat.catalog.stars.positions import motion_of
+from starcat.catalog.stars.proper_motion import propagate
 from starcat.catalog.stars.star_table import (
     add_nearest_neighbours,
     directions_of,
@@ -64,7 +65,7 @@ def supply_motions(draft: Draft) -> None:
     spec, stars = draft.spec, draft.stars
     entries = _Entries.of(stars)
     for name in spec.catalog.motions:
-        entries.note(match_source(name, supply_motions, stars, draft)[1])
+        entries.note(match_source(name, supply_motions, stars, draft)[1].table)
     moved = _with_motions(stars, entries, spec.middle_jyear)
     draft.motions = entries.table(stars, moved)
     # The notes of the catalogs about unmoved stars are no longer true.
@@ -195,11 +196,10 @@ def to_sensor_band(draft: Draft) -> None:
 def _photometry(name: str, response: Response, draft: Draft) -> Other:
     """Return magnitudes predicted from a source, and record the files read in the draft."""
     entries, matches = match_source(name, to_sensor_band, draft.stars, draft)
-    best = matches.filter(pc.equal(matches["verdict"], "unique"))
-    entry_rows = np.searchsorted(entries["star_id"].to_numpy(), best["counterpart_id"].to_numpy())
-    rows = best["star"].to_numpy().astype(np.int64)
+    best = np.flatnonzero(pc.equal(matches.table["verdict"], "unique"))
+    rows = matches.table["star"].to_numpy()[best].astype(np.int64)
     draft.sources[-1] = replace(draft.sources[-1], joined=len(best))
-    return other_of(entries.take(pa.array(entry_rows)), rows, name, response)
+    return other_of(entries.take(pa.array(matches.counterpart[best])), rows, name, response)
 
 
 def _band_notes(in_band: InBand, spec: BuildSpec) -> tuple[str, ...]:
@@ -250,12 +250,8 @@ class _Entries:
         start = sum(map(len, self.matches))
         self.matches.append(best)
         star = best["star"].to_numpy()
-        motion = Motion(
-            *(floats_of(best, name) for name in ("ra_deg", "dec_deg")),
-            *(floats_of(best, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec")),
-        )
         # The motion at the epoch of the star's position: the entry moves on a straight line.
-        motion = propagate(motion, self.epoch_jyear[star] - floats_of(best, "epoch_jyear"))
+        motion = propagate(motion_of(best), self.epoch_jyear[star] - floats_of(best, "epoch_jyear"))
         has_motion = ~(np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr))
         outcome = best["verdict"].to_numpy(zero_copy_only=False).astype(object)
         is_of_other = best["star_rank"].to_numpy() > 1

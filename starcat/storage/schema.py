@@ -109,23 +109,37 @@ class ProductSchema:
                 found=table.column_names,
                 expected=expected,
             )
+        self.check_values(table)
+
+    def check_values(self, table: pa.Table, where: str | None = None, hint: str = "") -> None:
+        """Check the values of the columns that a table has: their types, and that none is missing.
+
+        Only nullable columns can lack values. NaN and infinity are no values.
+        """
+        import pyarrow.compute as pc
+
         for column in self.columns:
-            values = table[column.name]
-            kind = column.arrow_field.type
+            if column.name not in table.column_names:
+                continue
+            values, kind = table[column.name], column.arrow_field.type
+            problem, found = "", str(values.type)
             if values.type != kind:
+                problem = f"found {found}; {self.name} says {kind}"
+            elif not column.nullable:
+                missing = values.null_count
+                if column.dtype.startswith("float"):
+                    missing += pc.sum(pc.invert(pc.is_finite(values))).as_py() or 0
+                found = f"{missing} rows have no value"
+                problem = f"{found}; {self.name} allows none" if missing else ""
+            if problem:
                 raise SchemaError(
-                    f"{self.product}.{column.name}: found {values.type}; {self.name} says {kind}",
+                    problem,
+                    where=f"{where}: {column.name}" if where else f"{self.product}.{column.name}",
                     product=self.product,
                     field=column.name,
-                    found=str(values.type),
+                    found=found,
                     expected=str(kind),
-                )
-            if not column.nullable and values.null_count:
-                raise SchemaError(
-                    f"{self.product}.{column.name}: {values.null_count} rows have no value; "
-                    f"{self.name} allows none",
-                    product=self.product,
-                    field=column.name,
+                    hint=hint,
                 )
 
 

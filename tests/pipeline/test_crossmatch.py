@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from starcat.arrays import Mask
+from starcat.catalog.stars.positions import Positions
 from starcat.catalog.stars.proper_motion import Motion, propagate_directions
 from starcat.catalog.stars.star_table import floats_of, table_from_columns, with_columns
 from starcat.database.products.crossmatch import (
@@ -387,7 +388,9 @@ def test_separations_are_those_of_erfa_and_astropy():
     off = generator.uniform(0.0, 8.0, count) / 3600.0
     placed = np.degrees(end[1]) + off
     others = moving(np.degrees(end[0]), placed, epoch=epoch, moves=False)
-    star, counterpart, epochs, angle = candidate_pairs(stars, others, RADIUS)
+    star, counterpart, epochs, angle = candidate_pairs(
+        Positions.of(stars), Positions.of(others), RADIUS
+    )
     assert star.tolist() == counterpart.tolist() == list(range(count))
     there = SkyCoord(end[0] * units.rad, end[1] * units.rad)
     expected = there.separation(SkyCoord(np.degrees(end[0]) * units.deg, placed * units.deg)).rad
@@ -432,7 +435,9 @@ def test_no_candidate_is_missed(case):
     epochs = floats_of(stars, "epoch_jyear")[i], floats_of(others, "epoch_jyear")[j]
     epoch = np.where(is_theirs, *epochs)
     near = separation(at(stars, i, epoch), at(others, j, epoch)) <= radius_arcsec * ARCSEC
-    star, counterpart, _, _ = candidate_pairs(stars, others, radius_arcsec * ARCSEC)
+    star, counterpart, _, _ = candidate_pairs(
+        Positions.of(stars), Positions.of(others), radius_arcsec * ARCSEC
+    )
     assert star.tolist() == i[near].tolist()
     assert counterpart.tolist() == j[near].tolist()
 
@@ -496,6 +501,7 @@ def test_nothing_to_match_is_no_match(empty):
 
 
 def test_the_radius_itself_is_within():
-    exact = float(candidate_pairs(beside(0.0), beside(4.0), 1.0)[3][0])
-    assert len(candidate_pairs(beside(0.0), beside(4.0), exact)[0]) == 1
-    assert len(candidate_pairs(beside(0.0), beside(4.0), np.nextafter(exact, 0.0))[0]) == 0
+    places = Positions.of(beside(0.0)), Positions.of(beside(4.0))
+    exact = float(candidate_pairs(*places, 1.0)[3][0])
+    assert len(candidate_pairs(*places, exact)[0]) == 1
+    assert len(candidate_pairs(*places, np.nextafter(exact, 0.0))[0]) == 0

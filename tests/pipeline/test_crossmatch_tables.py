@@ -162,7 +162,7 @@ def changed(table: pa.Table, name: str, row: int, value: object) -> pa.Table:
         ("delta_mag", None, "delta_mag of row 7 is not that of its star"),
         ("n_candidates", 4, "n_candidates of row 7"),
         ("probability", 1.5, "probability of row 7"),
-        ("probability", float("nan"), "probability of row 7"),
+        ("probability", float("nan"), "crossmatch.probability: 1 rows have no value"),
         ("verdict", "sure", "verdict sure; expected one of unique, ambiguous, none"),
         ("verdict", "none", "stars have a counterpart, but the product crossmatch holds"),
     ],
@@ -320,5 +320,5 @@ def test_a_star_table_with_a_place_without_a_value_is_refused(tables, tmp_path):
         values = pa.array([value, *table["ra_deg"].to_pylist()[1:]])
         place = table.column_names.index("ra_deg")
         write_parquet(table.set_column(place, "ra_deg", values), tmp_path / "blank.parquet")
-        with pytest.raises(SchemaError, match="ra_deg: found 1 rows without a value"):
+        with pytest.raises(SchemaError, match="ra_deg: 1 rows have no value"):
             counterparts.read_star_table(tmp_path / "blank.parquet")

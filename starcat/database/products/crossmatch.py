@@ -17,11 +17,12 @@ import scipy
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from starcat.arrays import Array, Mask
-from starcat.catalog.stars.proper_motion import MAS, Motion, propagate_directions
+from starcat.arrays import Array, Directions, Mask
+from starcat.catalog.stars.positions import Positions
+from starcat.catalog.stars.proper_motion import MAS
 from starcat.catalog.stars.star_table import floats_of
 from starcat.database.products.kind import Extent, ProductKind, ProductSection, SpecFacts
-from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
+from starcat.geometry.sphere import chord_from_separation, saff_kuijlaars, separation
 from starcat.sections import CatalogName, Mag
 from starcat.storage.schema import product_schema
 
@@ -32,8 +33,6 @@ NEEDED = (
     *("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "mag", "band"),
 )
 """Columns of a star table that a cross-identification reads."""
-
-POSITION_COLUMNS = ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
 
 NUMBERS = ("hip_number", "hd_number")
 """Columns with published numbers, which a star table can lack."""
@@ -162,12 +161,13 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, options: Crossmatch) -> 
     2407.
     """
     radius_rad = options.radius_arcsec * ARCSEC
-    i, j, epoch, angle = candidate_pairs(stars, counterparts, radius_rad)
+    positions, other_positions = Positions.of(stars), Positions.of(counterparts)
+    i, j, epoch, angle = candidate_pairs(positions, other_positions, radius_rad)
     mag = floats_of(counterparts, "mag")
     delta = mag[j] - floats_of(stars, "mag")[i]
     n_candidates, n_stars = np.bincount(i)[i], np.bincount(j)[j]
     is_sure = (n_candidates == 1) & (n_stars == 1)
-    density = _density(counterparts, stars)
+    density = _density(other_positions.directions, positions.directions)
 
     error_arcsec, middle_mag = options.position_error_arcsec, options.expected_delta_mag
     if error_arcsec is None:
@@ -181,50 +181,51 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, options: Crossmatch) -> 
         middle_mag = float(np.median(known_delta)) if len(known_delta) >= MIN_MEASURED else 0.0
     if (share := options.completeness) is None:
         # Stars without a candidate, over the stars that would have none at random places.
-        blank = 1.0 - len(np.unique(i)) / max(len(stars), 1)
+        blank = 1.0 - np.count_nonzero(np.bincount(i)) / max(len(stars), 1)
         by_chance = np.exp(-np.sort(density) * np.pi * radius_rad**2)
         share = float(np.clip(1.0 - blank / by_chance.mean(), 0.001, 0.999)) if len(stars) else 0.5
     shared = min(share * len(stars) / max(len(counterparts), 1), 0.999)
-    still = ~(_has_motion(stars)[i] | _has_motion(counterparts)[j])
-    years = floats_of(counterparts, "epoch_jyear")[j] - floats_of(stars, "epoch_jyear")[i]
+    still = ~(positions.has_motion[i] | other_positions.has_motion[j])
+    years = other_positions.epoch_jyear[j] - positions.epoch_jyear[i]
     unmoved_arcsec = 1e-3 * options.unknown_motion_mas_yr * np.where(still, years, 0.0)
     error = np.hypot(error_arcsec, unmoved_arcsec) * ARCSEC
 
-    ratio = np.log(share) + _log_position(angle, error, radius_rad, options.outlier_share)
+    ratio = np.log(share) + np.logaddexp(
+        *log_position_densities(angle, error, radius_rad, options.outlier_share)
+    )
     ratio += _log_magnitude(delta - middle_mag, options.colour_spread_mag, mag, j)
     ratio -= np.log(density[i])
     ratio[_has_same_number(stars, counterparts, i, j)] += np.log(max(len(counterparts), 1))
     weight = np.exp(ratio) / ((1.0 - share) * (1.0 - shared))
     probability = pair_probabilities(i, j, weight)
     log_p = np.log(np.maximum(probability, 1e-300))
-    rank, star_rank = _ranks(i, log_p, angle, j), _ranks(j, log_p, angle, i)
+    rank, lead = _ranks(i, log_p, angle, j)
+    star_rank, star_lead = _ranks(j, log_p, angle, i)
     near, of_star = float(np.log(options.ambiguous_odds)), np.bincount(i, weight)[i]
-    lead, star_lead = log_p - _best_other(i, log_p, rank), log_p - _best_other(j, log_p, star_rank)
     verdict = np.full(len(i), "unique", dtype=object)
     verdict[(lead <= near) | (star_lead <= near)] = "ambiguous"
     verdict[(lead < -near) | (star_lead < -near)] = "none"
     verdict[of_star < options.min_probability * (1.0 + of_star)] = "none"
 
-    order = np.lexsort((rank, i))
-    other = counterparts.select(NEEDED).take(pa.array(j[order])).combine_chunks()
-    judged = {
+    other = counterparts.select(NEEDED).take(pa.array(j)).combine_chunks()
+    columns = {name: other[name] for name in NEEDED} | {
         "star": i,
+        "counterpart_id": other["star_id"],
         "rank": rank,
         "star_rank": star_rank,
         "n_candidates": n_candidates,
         "n_stars": n_stars,
         "compared_jyear": epoch,
         "separation_arcsec": np.degrees(angle) * 3600.0,
+        "delta_mag": pa.array(delta, mask=np.isnan(delta)),
         "position_error_arcsec": error / ARCSEC,
         "log10_likelihood_ratio": ratio / np.log(10.0),
         "probability": probability,
         "verdict": verdict,
     }
-    columns = {name: other[name] for name in NEEDED} | {"counterpart_id": other["star_id"]}
-    columns |= {name: pa.array(values[order]) for name, values in judged.items()}
-    columns["delta_mag"] = pa.array(delta[order], mask=np.isnan(delta[order]))
-    schema = product_schema("crossmatch").arrow_schema
+    schema, order = product_schema("crossmatch").arrow_schema, np.lexsort((rank, i))
     table = pa.table([columns[name] for name in schema.names], schema.names).cast(schema)
+    table = table.take(pa.array(order)).combine_chunks()
     return Matches(table, j[order], error_arcsec, middle_mag, share)
 
 
@@ -266,87 +267,57 @@ def _sum_of_others(group: Rows, values: Array) -> Array:
 
 
 def candidate_pairs(
-    stars: pa.Table, counterparts: pa.Table, radius_rad: float
+    stars: Positions, counterparts: Positions, radius_rad: float
 ) -> tuple[Rows, Rows, Array, Array]:
     """Find every pair within a radius, itself included, in order of (star, counterpart).
 
     Returns rows of stars, rows of counterparts, the Julian year at which they are compared, and
     their separation there, radians. A star with proper motion is moved to its candidate's epoch,
     a candidate with proper motion to the epoch of a star without.
+
+    In the middle of all epochs the two are farther apart than the radius by their motions at most:
+    Barnard's star reaches 10 arcsec per year, most stars next to nothing.
     """
-    is_moved = _has_motion(stars)
-    moved, still = map(np.flatnonzero, (is_moved, ~is_moved))
-    everyone = np.arange(len(counterparts))
-    near = _near(stars, moved, counterparts, everyone, radius_rad)
-    near_still = _near(counterparts, everyone, stars, still, radius_rad)
-    i, j = np.append(near[0], near_still[1]), np.append(near[1], near_still[0])
-    epoch = floats_of(counterparts, "epoch_jyear")[j]
-    only_candidate = _has_motion(counterparts)[j] & ~is_moved[i]
-    epoch[only_candidate] = floats_of(stars, "epoch_jyear")[i[only_candidate]]
-    angle = separation(_moved_to(stars, i, epoch), _moved_to(counterparts, j, epoch))
+    epochs = np.append(stars.epoch_jyear, counterparts.epoch_jyear)
+    first, last = (epochs.min(), epochs.max()) if len(epochs) else (0.0, 0.0)
+    middle, years = 0.5 * (first + last), 0.5 * (last - first)
+    near = [np.empty((2, 0), dtype=np.int64)]
+    others = list(_by_reach(counterparts, middle, years, radius_rad))
+    for rows, tree, reach in _by_reach(stars, middle, years, radius_rad):
+        for other_rows, other_tree, other_reach in others:
+            # Separations are compared exactly below.
+            chord = chord_from_separation(radius_rad + reach + other_reach) * (1.0 + 1e-9) + 1e-14
+            pairs = tree.sparse_distance_matrix(other_tree, chord, output_type="ndarray")
+            near.append(np.stack([rows[pairs["i"]], other_rows[pairs["j"]]]))
+    i, j = np.concatenate(near, axis=1)
+    only_candidate = counterparts.has_motion[j] & ~stars.has_motion[i]
+    epoch = np.where(only_candidate, stars.epoch_jyear[i], counterparts.epoch_jyear[j])
+    angle = separation(stars.at(epoch, i), counterparts.at(epoch, j))
     order = np.lexsort((j, i))
     order = order[angle[order] <= radius_rad]
     return i[order], j[order], epoch[order], angle[order]
 
 
-def _near(
-    moved: pa.Table, rows: Rows, others: pa.Table, other_rows: Rows, radius_rad: float
-) -> tuple[Rows, Rows]:
-    """Return rows of stars and of others that can be within the radius at an epoch of the others.
+def _by_reach(
+    positions: Positions, middle_jyear: float, years: float, radius_rad: float
+) -> Iterator[tuple[Rows, scipy.spatial.cKDTree, float]]:
+    """Yield groups of stars that move about as far in some years, the slow ones together.
 
-    All stars are moved to one epoch in the middle, and the radius of each is wider by its motion
-    to the farthest epoch: Barnard's star needs 10 arcsec per year, most stars next to nothing.
-    Stars whose radii differ by less than a factor of two are searched together.
+    Each has rows, a tree of directions in the middle of the epochs, and the farthest motion of a
+    star, radians.
     """
-    if not len(rows) or not len(other_rows):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    epochs = floats_of(others, "epoch_jyear")[other_rows]
-    middle = float(np.median(epochs))
-    speed = (
-        np.hypot(*(np.nan_to_num(floats_of(moved, name)[rows]) for name in POSITION_COLUMNS[2:]))
-        * MAS
-    )
-    radii = np.minimum(radius_rad + speed * np.abs(epochs - middle).max(), np.pi)
-    chords = 2.0 * np.sin(0.5 * radii) * (1.0 + 1e-9) + 1e-14  # separations are compared exactly
-    directions, tree = _moved_to(moved, rows, middle), _tree(_directions(others, other_rows))
-    level, near = np.frexp(chords)[1], []
-    for together in (np.flatnonzero(level == number) for number in np.unique(level)):
-        pairs = _tree(directions[together]).sparse_distance_matrix(
-            tree, chords[together].max(), output_type="ndarray"
-        )
-        near.append((rows[together[pairs["i"]]], other_rows[pairs["j"]]))
-    return np.concatenate([i for i, _ in near]), np.concatenate([j for _, j in near])
+    motion = positions.motion.pm_ra_cosdec_mas_yr, positions.motion.pm_dec_mas_yr
+    reach = np.where(positions.has_motion, np.hypot(*motion), 0.0) * MAS * years
+    level = np.ceil(np.log2(np.maximum(reach / radius_rad, 1.0)))
+    directions = positions.at(middle_jyear)
+    for rows in (np.flatnonzero(level == number) for number in np.unique(level)):
+        # A plain split by midpoints builds far faster and searches no slower on a sky of stars.
+        tree = scipy.spatial.cKDTree(directions[rows], leafsize=32, balanced_tree=False)
+        yield rows, tree, float(reach[rows].max())
 
 
-def _tree(directions: Array) -> scipy.spatial.cKDTree:
-    return scipy.spatial.cKDTree(directions, leafsize=32, balanced_tree=False)
-
-
-def _has_motion(table: pa.Table) -> Mask:
-    return ~(
-        np.isnan(floats_of(table, POSITION_COLUMNS[2]))
-        | np.isnan(floats_of(table, POSITION_COLUMNS[3]))
-    )
-
-
-def _directions(table: pa.Table, rows: Rows | slice = slice(None)) -> Array:
-    return directions_from_radec(*(floats_of(table, name)[rows] for name in POSITION_COLUMNS[:2]))
-
-
-def _moved_to(table: pa.Table, rows: Rows, epoch_jyear: Array | float) -> Array:
-    """Return directions of stars at an epoch; stars without proper motion stay."""
-    directions = _directions(table, rows)
-    moves = np.flatnonzero(_has_motion(table)[rows])
-    if len(moves):
-        motion = Motion(*(floats_of(table, name)[rows[moves]] for name in POSITION_COLUMNS))
-        years = epoch_jyear - floats_of(table, "epoch_jyear")[rows]
-        directions[moves] = propagate_directions(motion, years[moves])[1]
-    return directions
-
-
-def _density(counterparts: pa.Table, stars: pa.Table) -> Array:
+def _density(directions: Directions, star_directions: Directions) -> Array:
     """Return the counterparts per steradian around stars, over 9 tiles of the sky, never 0."""
-    directions, star_directions = _directions(counterparts), _directions(stars)
     middles = saff_kuijlaars(TILES)
     tree = scipy.spatial.cKDTree(middles)
     count = np.bincount(tree.query(directions)[1], minlength=TILES)
@@ -354,8 +325,10 @@ def _density(counterparts: pa.Table, stars: pa.Table) -> Array:
     return np.asarray(around[tree.query(star_directions)[1]] * TILES / (9.0 * 4.0 * np.pi))
 
 
-def _log_position(angle: Array, error: Array, radius_rad: float, outlier_share: float) -> Array:
-    """Return the logarithm of f: a normal error, and a share of outliers.
+def log_position_densities(
+    angle: Array, error: Array, radius_rad: float, outlier_share: float
+) -> tuple[Array, Array]:
+    """Return the logarithms of the two parts of f: of normal errors, and of outliers.
 
     Outliers have no scale of their own: between the error and the radius every factor of
     separation is as likely as any other, so that their density falls with its square.
@@ -364,7 +337,7 @@ def _log_position(angle: Array, error: Array, radius_rad: float, outlier_share: 
     scales = 0.5 + np.log(np.maximum(radius_rad / error, 1.0))
     with np.errstate(divide="ignore"):  # there may be no outliers
         far = np.log(outlier_share / (2.0 * np.pi * np.maximum(angle, error) ** 2 * scales))
-    return np.asarray(np.logaddexp(np.log1p(-outlier_share) + normal, far))
+    return np.log1p(-outlier_share) + normal, far
 
 
 def _log_magnitude(off_mag: Array, spread_mag: float, mag: Array, j: Rows) -> Array:
@@ -394,20 +367,18 @@ def _has_same_number(stars: pa.Table, counterparts: pa.Table, i: Rows, j: Rows) 
     return alike
 
 
-def _ranks(group: Rows, log_p: Array, angle: Array, other: Rows) -> Rows:
-    """Return each pair's rank within its group, from 1."""
+def _ranks(group: Rows, log_p: Array, angle: Array, other: Rows) -> tuple[Rows, Array]:
+    """Return each pair's rank within its group, from 1, and its lead over the likeliest other pair.
+
+    Leads are differences of ``log_p``, infinite without another pair.
+    """
     order = np.lexsort((other, angle, -log_p, group))
     rank = np.empty(len(group), dtype=np.int64)
     rank[order] = np.arange(len(group)) - np.searchsorted(group[order], group[order]) + 1
-    return rank
-
-
-def _best_other(group: Rows, log_p: Array, rank: Rows) -> Array:
-    """Return the likeliest other pair of each pair's group, as log_p; -inf without any."""
     first, second = np.full((2, group.max(initial=-1) + 1), -np.inf)
     first[group[rank == 1]] = log_p[rank == 1]
     second[group[rank == 2]] = log_p[rank == 2]
-    return np.asarray(np.where(rank == 1, second[group], first[group]))
+    return rank, log_p - np.where(rank == 1, second[group], first[group])
 
 
 def matched_rows(table: pa.Table) -> NDArray[np.intp]:
@@ -425,8 +396,7 @@ def counterpart_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
     """Yield contradictions within the crossmatch product, and with the stars."""
     paired_stars = stars.take(table["star"].combine_chunks())
     epoch = floats_of(table, "compared_jyear")
-    everyone = np.arange(len(table))
-    angle = separation(_moved_to(paired_stars, everyone, epoch), _moved_to(table, everyone, epoch))
+    angle = separation(*(Positions.of(each).at(epoch) for each in (paired_stars, table)))
     off = np.abs(np.degrees(angle) * 3600.0 - floats_of(table, "separation_arcsec"))
     expected = floats_of(table, "mag") - floats_of(paired_stars, "mag")
     delta = floats_of(table, "delta_mag")
@@ -435,7 +405,7 @@ def counterpart_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
     begins = np.diff(star, prepend=-1) != 0
     begins[1:] |= catalog[1:] != catalog[:-1]
     group = np.cumsum(begins) - 1
-    ranks = everyone - np.flatnonzero(begins)[group] + 1
+    ranks = np.arange(len(table)) - np.flatnonzero(begins)[group] + 1
     p = table["probability"].to_numpy()
     is_possible = (p >= 0.0) & (p <= 1.0) & (np.bincount(group, p)[group] <= 1.0 + 1e-9)  # rounding
     of_pair = "is not that of its star and its counterpart"
