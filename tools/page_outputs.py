@@ -59,10 +59,11 @@ VARYING = (
     re.compile(r"()(?=\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|\+00:00))"),
     re.compile(r"()(?=\d{4}-\d\d-\d\d$)"),
     re.compile(r"^()(?=[0-9a-f]{8}  )"),
-    # Bytes of a release and checksums of an image: the last digits of computed numbers in them
-    # depend on the processor (docs/decisions.md).
+    # Bytes of a release or of numbers as text, and checksums of an image: the last digits of
+    # computed numbers in them depend on the processor (docs/decisions.md).
     re.compile(r"^(?:new )?bytes +()(?=[1-9][\d,]*$)"),
     re.compile(r"\b()(?=0x[0-9a-f]{8}\b)"),
+    re.compile(r"(?<=csv, )()(?=[\d,]+ bytes)"),
     # Random keys, and digests, in which the versions of libraries are.
     re.compile(r"(?<![\w.])()(?=[0-9a-f]{64}\b|[0-9a-f]{16}\b)(?!\d+\b)"),
 )

@@ -125,9 +125,10 @@ def seen_of(stars, count, seed, move=None):
     )
 
 
-def test_noise_is_not_taken_for_motion(stars):
+@pytest.mark.parametrize("seeds", [range(8), pytest.param(range(8, 40), marks=pytest.mark.slow)])
+def test_noise_is_not_taken_for_motion(stars, seeds):
     values = values_of(CAMERA)
-    for seed in range(30):
+    for seed in seeds:
         seen = seen_of(stars, 6, seed)
         assert model.with_motion_if_seen(seen, values, SIZE, 0.3).motion is None
 

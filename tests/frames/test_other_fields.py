@@ -41,7 +41,11 @@ def frame_of(sky, fov_deg, seed):
 
 
 @pytest.mark.parametrize(
-    ("fov_deg", "engine"), [*((fov_deg, "auto") for fov_deg in (7.5, 13.4, 16.0)), (8.0, "numpy")]
+    ("fov_deg", "engine"),
+    [
+        *((fov_deg, "auto") for fov_deg in (7.5, 13.4, 16.0)),
+        pytest.param(8.0, "numpy", marks=pytest.mark.slow),
+    ],
 )
 def test_the_field_of_another_lens_is_named(sky, fov_deg, engine):
     matcher, frame = Matcher(sky, engine=engine), frame_of(sky, fov_deg, 5)

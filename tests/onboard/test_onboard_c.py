@@ -242,7 +242,7 @@ def test_every_function_refuses_null_pointers(folder, tmp_path):
         lines.append(f'  if ({name}({zeros}) != STARCAT_E_NULL) (void)puts("{name}");')
     source = tmp_path / "nulls.c"
     source.write_text("\n".join([*lines, "  return 0;", "}", ""]), encoding="utf-8")
-    program = build(folder, "nulls", str(source))
+    program = build(folder, "nulls", str(source), flags=("-O0",))
     ran = subprocess.run([program], capture_output=True, text=True, check=False)
     assert (ran.returncode, ran.stdout) == (0, "")
 
@@ -399,6 +399,6 @@ def test_a_session_survives_a_minute_of_operations(folder):
 
 
 def test_a_mission_loads_tracks_uploads_refuses_recovers_and_restarts(folder):
-    said = make(folder, "example")
+    said = make(folder, "example", "CFLAGS=-O0", "BUILD=build-example")
     phases = re.findall(r"^\w.*?  +(yes|NO)$", said, re.MULTILINE)
     assert phases == ["yes"] * 18, said
