@@ -102,7 +102,7 @@ def test_every_star_is_accounted_for(small_database, make, sao_lines):
     lines[faded] = with_text(lines[faded], 80, b" 9.9")
     lines[brighter] = with_text(lines[brighter], 80, b" 3.1")
     dec = float(lines[shifted][193:204])
-    lines[shifted] = with_text(lines[shifted], 193, f"{dec + 1e-6:+11.8f}".encode())
+    lines[shifted] = with_text(lines[shifted], 193, f"{dec + 1e-8:+11.8f}".encode())
     new = with_text(lines[gone], 0, b"   601")
     lines.append(with_text(new, 193, f"{float(new[193:204]) + 0.001:+11.8f}".encode()))
     lines.append(with_text(lines.pop(renumbered), 0, b"   602"))
@@ -119,7 +119,7 @@ def test_every_star_is_accounted_for(small_database, make, sao_lines):
     }  # fmt: skip
     moved = {star.star_id: star for star in found.moved}
     assert moved.keys() == {shifted + 1, brighter + 1}
-    assert moved[shifted + 1].moved_arcsec == pytest.approx(0.20626, rel=1e-3)
+    assert moved[shifted + 1].moved_arcsec == pytest.approx(0.0020626, rel=1e-3)
     assert moved[shifted + 1].mag_a == moved[shifted + 1].mag_b
     assert moved[brighter + 1].moved_arcsec < MOVED_ARCSEC
     assert moved[brighter + 1].mag_b == 3.1

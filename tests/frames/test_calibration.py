@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -347,6 +348,17 @@ def test_json_has_the_covariance_and_every_model(starcat, small_database, small_
     assert said["frames"][8]["reason"] == "fewer than 4 centroids of the frame are usable"
     assert [len(frame["remarks"]) for frame in said["frames"]] == [0] * 8 + [1]
     assert said["frames"][8]["remarks"][0].startswith("not used: light; used are centroids_px")
+
+
+def test_the_plot_has_residuals_along_and_across_the_radius():
+    generator = np.random.default_rng(3)
+    px, residual_px = generator.uniform(0.0, 1024.0, (50, 2)), generator.normal(0.0, 1.0, (50, 2))
+    camera = Camera(1024, 1024, fov_x_deg=12.0)
+    fit = SimpleNamespace(seen=SimpleNamespace(centroids_px=px), residual_px=residual_px)
+    along, across = files._polar(SimpleNamespace(fit=fit, camera=camera))
+    angle = np.angle((px - camera.principal_point_px) @ [1.0, 1.0j])
+    turned = residual_px @ [1.0, 1.0j] * np.exp(-1.0j * angle)
+    np.testing.assert_allclose(along + 1.0j * across, turned, rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow
