@@ -60,8 +60,8 @@ class Client:
             if job["state"] == "done":
                 return job
             if job["state"] in ("failed", "cancelled"):
-                told = job.get("error") or {"detail": f"the job {job_id} was {job['state']}"}
-                raise _error_of(told, None)
+                problem = job.get("error") or {"detail": f"the job {job_id} was {job['state']}"}
+                raise _error_of(problem, None)
             time.sleep(AGAIN_S)
 
     def sql(
@@ -221,10 +221,10 @@ class Client:
             return answer
         with closing(answer):
             try:
-                told = dict(answer.json())
+                problem = dict(answer.json())
             except ValueError:
-                told = {"detail": f"{url}: answered {answer.status_code} {answer.reason}"}
-            raise _error_of(told, answer.status_code)
+                problem = {"detail": f"{url}: answered {answer.status_code} {answer.reason}"}
+            raise _error_of(problem, answer.status_code)
 
 
 def _receive(answer: requests.Response, path: Path) -> str:
@@ -243,7 +243,7 @@ def _receive(answer: requests.Response, path: Path) -> str:
     return digest.hexdigest()
 
 
-def _error_of(told: Mapping[str, Any], status: int | None) -> Exception:
-    words = str(told.get("detail", "no words"))
-    error = error_from_fields({"kind": "", "problem": words, **told})
-    return error or ServiceError(words, exit_code=int(told.get("code", 1)), status=status)
+def _error_of(problem: Mapping[str, Any], status: int | None) -> Exception:
+    words = str(problem.get("detail", "no words"))
+    error = error_from_fields({"kind": "", "problem": words, **problem})
+    return error or ServiceError(words, exit_code=int(problem.get("code", 1)), status=status)

@@ -200,28 +200,28 @@ SAME_PRODUCTS = 7
 """Exit code of a rebuild by other software that has the same products, but not every byte."""
 
 
-def print_verification(found: Verification) -> None:
+def print_verification(verification: Verification) -> None:
     """Print what a verification found."""
-    name, count = found.folder.resolve().name, len(found.findings)
+    name, count = verification.folder.resolve().name, len(verification.findings)
     outcome = f"{count} problem{'s' * (count != 1)}" if count else "sound"
-    title = f"{name}: {outcome} ({count_of(found.checks, 'check')})"
+    title = f"{name}: {outcome} ({count_of(verification.checks, 'check')})"
     if not count:
         print_table("", (title,), [])
         return
     columns = {"file": "{0.file}", "product": "{0.product}", "problem": "{0.problem}"}
-    print_things(title, found.findings, columns)
+    print_things(title, verification.findings, columns)
 
 
-def print_difference(found: Difference, name_a: str, name_b: str) -> None:
+def print_difference(difference: Difference, name_a: str, name_b: str) -> None:
     """Print the differences of two databases."""
-    if found.is_same and not found.software:
+    if difference.is_same and not difference.software:
         typer.echo(f"{name_a} and {name_b} are identical: spec, sources, stars and products")
         return
     one_sided = ("designation", "mag", "reason")
     stars: dict[str, tuple[str, ...]] = {"came": one_sided, "went": one_sided}
     stars["moved"] = ("designation", "moved_arcsec", "mag_a", "mag_b")
     products = ("product", "rows_a", "rows_b", "content")
-    show_result(found, f"A: {name_a}; B: {name_b}", columns={**stars, "products": products})
+    show_result(difference, f"A: {name_a}; B: {name_b}", columns={**stars, "products": products})
 
 
 _BARS, _BAR_WIDTH = 20, 50

@@ -299,19 +299,19 @@ def _say_crowded(answers: Sequence[FrameAnswer]) -> None:
         )
 
 
-def print_sky_in_time(known: Sequence[tuple[str, dict[str, Any]]]) -> None:
+def print_sky_in_time(skies: Sequence[tuple[str, dict[str, Any]]]) -> None:
     """Print the facts that need a time (`SkyInTime.content`), by the names of the frames."""
-    if not known:
+    if not skies:
         return
     shown = (
         *("frame", "correction_arcsec", "residual_arcsec"),
         *("sun_angle_deg", "moon_angle_deg", "earth_limb_angle_deg"),
     )
-    rows = [{"frame": name, **sky} for name, sky in known]
-    print_rows(rows, f"With aberration, at {known[0][1]['time']}", shown)
+    rows = [{"frame": name, **sky} for name, sky in skies]
+    print_rows(rows, f"With aberration, at {skies[0][1]['time']}", shown)
     bodies = [
         {"frame": name, "body": body["name"], **body, "centroid": body["row"] is not None}
-        for name, sky in known
+        for name, sky in skies
         for body in sky["bodies"]
     ]
     of_body = ("frame", "body", "x_px", "y_px", "mag", "from_boresight_deg", "centroid")

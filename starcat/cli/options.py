@@ -154,20 +154,20 @@ def takes(command: Callable[..., Any], declaration: type, *names: str) -> None:
     command.__annotations__ = {each.name: each.annotation for each in parameters}
 
 
-def option_values(declaration: type, given: Mapping[str, Any]) -> dict[str, Any]:
+def option_values(declaration: type, line_values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of declared options from the values of a command line, by name."""
     values = {}
     for name, each in options_of(declaration).items():
-        value = given.get(name, each.default)
+        value = line_values.get(name, each.default)
         values[name] = each.parse(value) if each.parse and isinstance(value, str) else value
     return values
 
 
-def options_of_line(given: Mapping[str, Any]) -> IdentifyOptions:
+def options_of_line(line_values: Mapping[str, Any]) -> IdentifyOptions:
     """Return the options of an identification on a command line, without the camera."""
-    if given["track"] and given["prior_q"] is not None:
+    if line_values["track"] and line_values["prior_q"] is not None:
         raise ConfigError("--track finds the priors itself", hint="leave out --prior-q, or --track")
-    return IdentifyOptions(**{**option_values(IdentifyOptions, given), "camera": None})
+    return IdentifyOptions(**{**option_values(IdentifyOptions, line_values), "camera": None})
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
@@ -271,10 +271,10 @@ def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None =
     return local_preset(name, changed_keys(changes))
 
 
-def changed_keys(given: list[str] | None) -> dict[str, str]:
+def changed_keys(texts: list[str] | None) -> dict[str, str]:
     """Return the values of ``KEY=VALUE`` texts by key."""
     changes = {}
-    for text in given or []:
+    for text in texts or []:
         key, separator, value = text.partition("=")
         if not separator or not key.strip():
             raise ConfigError(f"--set {text!r} is not KEY=VALUE, such as camera.fov_x_deg=16")
@@ -322,7 +322,7 @@ def camera_of_options(
 
 
 def inputs_by_source(
-    given: list[str] | None, only: str | None = None, maps: list[Path] | None = None
+    texts: list[str] | None, only: str | None = None, maps: list[Path] | None = None
 ) -> Mapping[str, list[Path]]:
     """Return the paths of ``SOURCE=PATH`` texts by source, after adding the sources of maps."""
     from starcat.catalog.source import give_map, source_given
@@ -332,7 +332,7 @@ def inputs_by_source(
     for map_path in maps or []:
         give_map(map_path)
     inputs: dict[str, list[Path]] = {}
-    for text in given or []:
+    for text in texts or []:
         name, separator, path = text.partition("=")
         if only is not None and (name != only or not separator):
             name, separator, path = only, "=", text

@@ -137,7 +137,7 @@ def _keep_out(text: str | None) -> dict[str, float]:
     return angles
 
 
-def print_plan(plan: Plan, row: int | None, chosen: Choice | None) -> None:
+def print_plan(plan: Plan, row: int | None, choice: Choice | None) -> None:
     """Print attitudes, gaps, the stars of one attitude, and the stars chosen for it."""
     rows = [_cells(plan, k) for k in range(min(len(plan), MAX_ROWS))]
     facts = plan.summary
@@ -152,13 +152,13 @@ def print_plan(plan: Plan, row: int | None, chosen: Choice | None) -> None:
         for gap in plan.gaps[:MAX_ROWS]
     ]  # fmt: skip
     print_table(f"Gaps: {len(plan.gaps)}", ("from", "to", "attitudes", "because of"), gaps, (2,))
-    if chosen is not None:
+    if choice is not None:
         stars: list[dict[str, Any]] = [
-            *({**star, "why": f"taken in stage {star['stage']}"} for star in chosen.taken),
-            *({**star, "why": f"no: {star['reason']}"} for star in chosen.left),
+            *({**star, "why": f"taken in stage {star['stage']}"} for star in choice.taken),
+            *({**star, "why": f"no: {star['reason']}"} for star in choice.left),
         ]
         shown = {"choice": "{0[why]}"}
-        _print_stars(f"Guide stars: {len(chosen.taken)} taken", stars, shown)
+        _print_stars(f"Guide stars: {len(choice.taken)} taken", stars, shown)
     elif row is not None:
         shown = {"contam.": "{0[contamination]:.3f}", "offset px": "{0[centroid_offset_px]:.3f}"}
         _print_stars(f"Guide stars of attitude {row + 1}", plan.stars_of(row), shown)

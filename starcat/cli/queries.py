@@ -130,18 +130,18 @@ def print_first_rows(session: Session, query: str, values: Mapping[str, Any], ro
     print_result(table)
 
 
-def print_result(found: ResultTable) -> None:
+def print_result(table: ResultTable) -> None:
     """Print rows as a table, or one below the other if the table is too wide."""
-    cells = found.texts
-    headings = [f"{c.name}\n[{c.unit}]" if c.unit else c.name for c in found.columns]
+    cells = table.texts
+    headings = [f"{c.name}\n[{c.unit}]" if c.unit else c.name for c in table.columns]
     if not cells or table_width(headings, cells) <= MAX_WIDTH:
-        numbers = [k for k, column in enumerate(found.columns) if column.is_number]
+        numbers = [k for k, column in enumerate(table.columns) if column.is_number]
         print_table("", headings, cells, numbers)
     else:
         for k, row in enumerate(cells):
-            facts = [(c.name, cell, c.unit) for c, cell in zip(found.columns, row, strict=True)]
+            facts = [(c.name, cell, c.unit) for c, cell in zip(table.columns, row, strict=True)]
             print_table(f"row {k + 1}", ["column", "value", "unit"], facts)
-    if found.is_cut:
+    if table.is_cut:
         first = "the first row" if len(cells) == 1 else f"the first {len(cells)} rows"
         say(f"{first}; --rows N shows more, -o FILE writes all")
 

@@ -59,7 +59,7 @@ def publish_command(
 
 @app.command("pull")
 def pull_command(
-    wanted: Annotated[
+    name_version: Annotated[
         str | None,
         typer.Argument(metavar="NAME@VERSION", help="NAME@latest or NAME for the latest."),
     ] = None,
@@ -100,9 +100,9 @@ def pull_command(
             "trust": trust,
         }  # fmt: skip
         if locked:
-            pulled = pull_pinned(wanted, registry, output, **pull_options)
-        elif wanted:
-            pulled = [pull(wanted, registry, output, **pull_options)]
+            pulled = pull_pinned(name_version, registry, output, **pull_options)
+        elif name_version:
+            pulled = [pull(name_version, registry, output, **pull_options)]
         else:
             raise ConfigError(
                 "no database", hint="name one, NAME@VERSION, or give --locked for all pins"

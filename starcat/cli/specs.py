@@ -353,7 +353,7 @@ def _show_starter(
         "remain when a few are missed"
     )
     warn(figures.advice)
-    if starter.catalog.is_embedded and starter.own.faint_limit_mag >= starter.deepest_mag:
+    if starter.catalog.is_embedded and starter.row_of_spec.faint_limit_mag >= starter.deepest_mag:
         say("a deeper catalog: --catalog SOURCE with its --input, as for 'starcat build'")
     say(figures.in_words)
     options = [f" --source {map_file}" for map_file in sources or ()]

@@ -31,7 +31,7 @@ from starcat.matcher.methods.votes import has_few_neighbours
 from starcat.matcher.observation import Dropped, Frame, Frames
 from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
-from starcat.matcher.refusal import Reason, Refusal, known_of
+from starcat.matcher.refusal import Reason, Refusal, stated_facts
 from starcat.matcher.result import IDS_AT, MATRIX_AT, SHAPE_AT, MatchResult, Status, no_match
 from starcat.matcher.search_tables import search_tables
 from starcat.matcher.settings import Settings
@@ -387,12 +387,12 @@ class Search:
         why = _refusal(REASONS[reason], n_matched, chance, share, n_usable, prior)
         why = with_few_stars(why, self._database, frame.camera)
         noises = self._settings.noise_px, self._settings.noise_mag
-        inputs = known_of(frame.mag is not None, *noises, n_usable < count)
+        inputs = stated_facts(frame.mag is not None, *noises, n_usable < count)
         candidate = MatchResult.of(content) if focal_length_px else None
         facts = ("time_s", "frame", "database", "noise_px", "otherwise_px", "origin", "dropped")
         return no_match(
             count,
-            refusal=replace(why, known=inputs, candidate=candidate),
+            refusal=replace(why, facts=inputs, candidate=candidate),
             **{name: content[name] for name in facts if name in content},
         )
 

@@ -17,7 +17,7 @@ from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Candidates, Frame, Observation, observe
 from starcat.matcher.pose import fit_by_weights, focal_length_error_px
 from starcat.matcher.prior import Prior, search_near
-from starcat.matcher.refusal import Refusal, known_of
+from starcat.matcher.refusal import Refusal, stated_facts
 from starcat.matcher.result import MatchResult, Origin, no_match
 from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, certainty
 from starcat.matcher.shape import of_scale
@@ -200,8 +200,8 @@ def result_of_search(
         if agreement.withheld is None and agreement.chance <= limit_of_answers:
             return best
     noises = observation.settings.noise_px, observation.settings.noise_mag
-    inputs = known_of(observation.mag is not None, *noises, bool(observation.dropped))
-    why = replace(_refusal_of(agreement, observation, limit, prior), known=inputs, candidate=best)
+    inputs = stated_facts(observation.mag is not None, *noises, bool(observation.dropped))
+    why = replace(_refusal_of(agreement, observation, limit, prior), facts=inputs, candidate=best)
     return no_match(count, observation.dropped, why, origin=origin)
 
 

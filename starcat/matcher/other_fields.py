@@ -16,7 +16,7 @@ import numpy as np
 
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroids import MeasuredFrame, exchanged, upside_down
-from starcat.matcher.refusal import Known, Reason, Refusal
+from starcat.matcher.refusal import Fact, Reason, Refusal
 from starcat.matcher.result import MatchResult
 
 FOV_ERROR = 0.05
@@ -127,9 +127,9 @@ def explained(
             )
             return replace(refused, refusal=why)
     fields = [2.0 * math.degrees(math.atan(0.5 * camera.width_px / focal)) for focal in tried]
-    facts: frozenset[Known] = refusal.known | frozenset[Known](("explained",))
+    facts: frozenset[Fact] = refusal.facts | frozenset[Fact](("explained",))
     between = (min(fields), max(fields)) if fields else None
-    return replace(refused, refusal=replace(refusal, known=facts, tried_fov_deg=between))
+    return replace(refused, refusal=replace(refusal, facts=facts, tried_fov_deg=between))
 
 
 class _Time:

@@ -14,7 +14,7 @@ Reason = Literal[
     "mirrored", "exchanged", "time", "steps", "few_guide_stars",
 ]  # fmt: skip
 
-Known = Literal[
+Fact = Literal[
     "magnitudes", "noise_mag", "noise_px", "dropped", "explained", "picture", "bright_picture",
     "range",
 ]  # fmt: skip
@@ -42,15 +42,15 @@ class Clause:
     """One piece of advice, and its conditions."""
 
     text: str
-    unless: Known | None = None
-    only_if: Known | None = None
+    unless: Fact | None = None
+    only_if: Fact | None = None
 
 
-def known_of(
+def stated_facts(
     has_magnitudes: bool, noise_px: float | None, noise_mag: float | None, has_dropped: bool
-) -> frozenset[Known]:
+) -> frozenset[Fact]:
     """Return the inputs that the caller of a search has given."""
-    stated: dict[Known, bool] = {
+    stated: dict[Fact, bool] = {
         "magnitudes": has_magnitudes,
         "noise_px": noise_px is not None,
         "noise_mag": noise_mag is not None,
@@ -216,7 +216,7 @@ class Refusal:
     tried_fov_deg: tuple[float, float] | None = None
     mean_stars: float | None = None
     searched_fov_deg: float | None = None
-    known: frozenset[Known] = field(default=frozenset(), repr=False, compare=False)
+    facts: frozenset[Fact] = field(default=frozenset(), repr=False, compare=False)
     # A MatchResult or None; its module imports this one.
     candidate: Any = field(default=None, repr=False, compare=False)
 
@@ -273,7 +273,7 @@ class Refusal:
                 return fits, "allow a larger error ({fov_error})"
             return fits, "build a database for it"
         clauses = CLAUSES[self.reason]
-        if "picture" in self.known:
+        if "picture" in self.facts:
             clauses = CLAUSES_OF_PICTURES.get(self.reason, clauses)
         *others, last = [clause.text for clause in clauses if self._is_of_use(clause)]
         if self.tried_fov_deg is not None:
@@ -287,8 +287,8 @@ class Refusal:
         return advice_in_words(self.advice)
 
     def _is_of_use(self, clause: Clause) -> bool:
-        is_needed = clause.only_if is None or clause.only_if in self.known
-        return is_needed and clause.unless not in self.known
+        is_needed = clause.only_if is None or clause.only_if in self.facts
+        return is_needed and clause.unless not in self.facts
 
     def __repr__(self) -> str:
         return f"<Refusal {self.reason}: {self.message}>"

@@ -201,7 +201,7 @@ class Starter:
         return tuple(name for name in USUAL_PRODUCTS if name not in self.spec.products.requested)
 
     @property
-    def own(self) -> LimitRow:
+    def row_of_spec(self) -> LimitRow:
         """The row of the spec's own limit."""
         limit = self.spec.selection.faint_limit_mag
         return next(row for row in self.limits if row.faint_limit_mag == limit)
@@ -442,7 +442,7 @@ def _row(sky: pa.Table, spec: BuildSpec) -> LimitRow:
 
 def advice(starter: Starter) -> Sequence[str]:
     """Return remarks on the limit of a first spec."""
-    row, spec = starter.own, starter.spec
+    row, spec = starter.row_of_spec, starter.spec
     remarks = [*spec.exposure_notes, *spec.exposure_proposal]
     if starter.spec.selection.faint_limit_mag > starter.deepest_mag + 0.1:
         remarks.append(

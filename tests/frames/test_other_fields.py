@@ -14,7 +14,7 @@ from starcat.matcher import other_fields
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.other_fields import SEARCHES, parts_of_fields
-from starcat.matcher.refusal import HINTS, Refusal, known_of
+from starcat.matcher.refusal import HINTS, Refusal, stated_facts
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 OWN = Camera(1024, 1024, fov_x_deg=12.0)
@@ -125,8 +125,8 @@ def test_advice_is_only_what_is_new_to_the_caller():
     nothing = Refusal("chance")
     assert nothing.hint.startswith("give magnitudes, state the noise of centroids")
     assert "explain" in nothing.hint
-    given = known_of(True, 0.3, None, has_dropped=False)
-    told = Refusal("chance", known=given | {"explained"}, tried_fov_deg=(6.0, 24.0)).hint
+    given = stated_facts(True, 0.3, None, has_dropped=False)
+    told = Refusal("chance", facts=given | {"explained"}, tried_fov_deg=(6.0, 24.0)).hint
     assert told == (
         "state the noise of magnitudes (noise_mag), check the field of view and the size of the "
         "camera (camera), or find more stars; fields of 6 to 24 deg and the mirrored frame were "
@@ -134,7 +134,7 @@ def test_advice_is_only_what_is_new_to_the_caller():
     )
     assert any("dropped" in text for text in HINTS["too_few_stars"])
     assert "dropped" not in Refusal("too_few_stars").hint
-    assert "dropped" in Refusal("too_few_stars", known=known_of(True, None, None, True)).hint
+    assert "dropped" in Refusal("too_few_stars", facts=stated_facts(True, None, None, True)).hint
 
 
 def test_the_command_states_the_field_and_takes_it(starcat, small_database, tmp_path):
@@ -230,15 +230,15 @@ def test_a_bright_picture_is_called_one(sky, tmp_path, name):
 
 def test_advice_for_pictures_begins_with_field_flip_and_lights():
     for reason in ("chance", "no_candidate", "steps", "time"):
-        plain = Refusal(reason, known=frozenset(["picture"]))
+        plain = Refusal(reason, facts=frozenset(["picture"]))
         assert (
             plain.hint.index("(fov_deg)") < plain.hint.index("(flip)") < plain.hint.index("light")
         )
         assert "noise" not in plain.hint
         assert "state the range" in plain.hint
-        known = Refusal(reason, known=frozenset(["picture", "range"]))
+        known = Refusal(reason, facts=frozenset(["picture", "range"]))
         assert "state a wider range" in known.hint
-    assert "(tolerance_px)" in Refusal("chance", known=frozenset(["picture"])).hint
+    assert "(tolerance_px)" in Refusal("chance", facts=frozenset(["picture"])).hint
     assert "check the field of view" in Refusal("chance").hint
 
 
@@ -254,5 +254,5 @@ def test_a_picture_that_is_refused_gets_the_advice_for_pictures(sky, tmp_path):
     ).save(path)
     [answer] = answer_file(path, Matcher(sky), IdentifyOptions(fov_deg=(12.0, 12.0)))
     assert not answer.result.ok
-    assert {"picture"} <= answer.result.refusal.known
+    assert {"picture"} <= answer.result.refusal.facts
     assert "(flip)" in answer.result.refusal.hint

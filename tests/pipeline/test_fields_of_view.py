@@ -96,8 +96,8 @@ def test_every_camera_identifies_its_frames(fov_deg, tmp_path):
 def test_init_thins_to_a_number_of_stars_a_field(fov_deg):
     starter = started(fov_deg)
     assert starter.spec.selection.max_stars_per_field == STARS_A_FIELD
-    assert starter.thinned.guide_stars < starter.own.guide_stars
-    assert starter.thinned.stars.one_percent >= starter.own.stars.one_percent - 1
+    assert starter.thinned.guide_stars < starter.row_of_spec.guide_stars
+    assert starter.thinned.stars.one_percent >= starter.row_of_spec.stars.one_percent - 1
     assert starter.left_out == ()
 
 

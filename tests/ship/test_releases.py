@@ -47,7 +47,7 @@ from starcat.ship.releases.tree import (
     Listed,
     choose,
     index_bytes,
-    parse_wanted,
+    parse_name_version,
     read_registry_index,
     tree_files,
 )
@@ -219,11 +219,11 @@ def test_the_order_of_publishing_does_not_show(database_version):
 )  # fmt: skip
 def test_what_is_no_name_and_version(text):
     with pytest.raises(ConfigError, match="is not NAME@VERSION"):
-        parse_wanted(text)
+        parse_name_version(text)
 
 
 def test_a_name_alone_means_the_latest_version():
-    assert parse_wanted("small@latest") == parse_wanted("small") == ("small", None)
+    assert parse_name_version("small@latest") == parse_name_version("small") == ("small", None)
 
 
 def test_an_address_without_a_registry_and_one_without_a_server():

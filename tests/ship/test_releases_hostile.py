@@ -23,7 +23,7 @@ from starcat.ship.releases import files, lockfile
 from starcat.ship.releases.lockfile import pull_pinned
 from starcat.ship.releases.publishing import publish
 from starcat.ship.releases.registry import FolderRegistry, open_registry
-from starcat.ship.releases.tree import MAX_INDEX_BYTES, MAX_MANIFEST_BYTES, Blob, parse_wanted
+from starcat.ship.releases.tree import MAX_INDEX_BYTES, MAX_MANIFEST_BYTES, Blob, parse_name_version
 from starcat.storage.atomic import file_sha256
 from starcat.storage.download import DownloadOptions, download, part_of
 
@@ -213,7 +213,7 @@ def test_a_spec_and_a_registry_refuse_the_same_versions(version, small_spec):
 def test_a_spec_and_a_registry_take_the_same_versions(version, small_spec):
     content = tomllib.loads(small_spec) | {"version": version}
     assert spec_from_dict(content, "spec.toml").version == version
-    assert parse_wanted(f"small@{version}") == ("small", version)
+    assert parse_name_version(f"small@{version}") == ("small", version)
 
 
 # Systems without POSIX --------------------------------------------------------------------------

@@ -37,7 +37,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions, SearchOptions, options_of
 from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, explained
 from starcat.matcher.prior import PriorLike, prior_of
-from starcat.matcher.refusal import Known
+from starcat.matcher.refusal import Fact
 from starcat.matcher.result import GivenAs, MatchResult
 from starcat.matcher.settings import MAX_STEPS, SCALE_FREE
 from starcat.matcher.tracking import Tracker
@@ -201,12 +201,12 @@ class FileAnswers:
         why = refused.refusal
         if why is None or not self.is_image:
             return refused
-        facts: list[Known] = ["picture"]
+        facts: list[Fact] = ["picture"]
         if self.options.fov_deg is not None:
             facts.append("range")
         if why.reason == "too_few_stars" and _is_bright(self._image):
             facts.append("bright_picture")
-        return replace(refused, refusal=replace(why, known=why.known.union(facts)))
+        return replace(refused, refusal=replace(why, facts=why.facts.union(facts)))
 
     def _answer_again(
         self, refused: MatchResult, first: MeasuredFrame, fov_error: float

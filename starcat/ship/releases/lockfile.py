@@ -20,7 +20,7 @@ from starcat.progress import Progress, no_progress
 from starcat.resources import PathLike
 from starcat.ship.releases.pulling import Pulled, pull_release
 from starcat.ship.releases.registry import Registry, has_signatures, is_trusted, open_registry
-from starcat.ship.releases.tree import Release, check_version, choose, parse, parse_wanted
+from starcat.ship.releases.tree import Release, check_version, choose, parse, parse_name_version
 from starcat.storage.atomic import json_bytes, locked, make_folder, replace_file, writing
 from starcat.storage.download import DownloadOptions, is_address
 from starcat.storage.regular_files import read_regular_file
@@ -125,7 +125,7 @@ def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) 
 
 
 def pull(
-    wanted: str,
+    name_version: str,
     registry: PathLike | None = None,
     output: PathLike = "dist",
     *,
@@ -139,7 +139,7 @@ def pull(
 
     Parameters
     ----------
-    wanted : str
+    name_version : str
         ``NAME@VERSION``, ``NAME@latest`` or ``NAME``.
     registry : str or path-like, optional
         A folder, or an http(s) address; by default the registry of its pin.
@@ -169,7 +169,7 @@ def pull(
     folder = path_of("output", output)
     lock = folder / LOCK_NAME if lock is None else path_of("lock", lock)
     trust = None if trust is None else path_of("trust", trust)
-    name, version = parse_wanted(text_of_path("wanted", wanted))
+    name, version = parse_name_version(text_of_path("name_version", name_version))
     pin = read_pins(lock).get(name)
     address = None if registry is None else text_of_path("registry", registry)
     opened = open_registry(address or _registry_of(lock, name, pin), options)
@@ -211,7 +211,7 @@ def _check_pin(lock: Path, pin: Pin | None, release: Release, address: str) -> N
 
 
 def pull_pinned(
-    wanted: str | None,
+    name_version: str | None,
     registry: str | None,
     output: Path,
     lock: Path,
@@ -234,8 +234,8 @@ def pull_pinned(
             hint="'starcat pull NAME@VERSION --registry ...' writes it",
         )
     selected = [pins[name] for name in sorted(pins)]
-    if wanted is not None:
-        selected = [pin_of(lock, pins, *parse_wanted(wanted))]
+    if name_version is not None:
+        selected = [pin_of(lock, pins, *parse_name_version(name_version))]
     pulled = []
     for pin in selected:
         opened = open_registry(registry or pinned_registry(lock, pin), options)

@@ -194,7 +194,7 @@ def tree_files(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:
     return dict(sorted(files.items()))
 
 
-def parse_wanted(text: str) -> tuple[str, str | None]:
+def parse_name_version(text: str) -> tuple[str, str | None]:
     """Read ``NAME@VERSION``."""
     name, separator, version = text.partition("@")
     version = version if separator else LATEST
@@ -204,7 +204,7 @@ def parse_wanted(text: str) -> tuple[str, str | None]:
     except ValidationError as error:
         raise ConfigError(
             f"{text!r} is not NAME@VERSION, such as gaia-12deg@1.0.0 or gaia-12deg@latest",
-            key="wanted",
+            key="name_version",
             value=text,
         ) from error
     return name, None if version == LATEST else version

@@ -238,7 +238,7 @@ class NewDesign:
     """The design that a form asks for."""
 
     draft: SpecForm
-    remarks: list[str]  # remarks for people
+    remarks: list[str]  # for people
     job: str | None = None  # job that has to end before the form is sent again
 
 
