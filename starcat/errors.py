@@ -207,7 +207,12 @@ class StarcatError(Exception):
     value: object = Unstated.UNSTATED  # the value of it that the message states
     hint: str | Sequence[str] = ()  # what to do, or alternatives; "{name}" stands for a parameter
     where: object = ""  # the file, the key or the frame with the problem
+    path: Path | None = None  # the file or folder, if `where` is not it
     exit_code = 1
+
+    def __post_init__(self) -> None:
+        if self.path is None and isinstance(self.where, Path):
+            self.path = self.where
 
     @property
     def advice(self) -> tuple[str, ...]:
@@ -283,7 +288,6 @@ class SourceError(StarcatError):
 
     exit_code = 3
     source: str | None = None
-    path: Path | None = None
 
 
 class SourceMissing(SourceError):  # noqa: N818 - the name reads as the fact
@@ -333,11 +337,8 @@ class ServiceError(StarcatError):
     status: int | None = None
 
 
-@dataclass(eq=False, repr=False, kw_only=True)
 class OutputError(StarcatError):
     """A place that cannot be written to, or already holds something else."""
-
-    path: Path | None = None
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -361,7 +362,6 @@ class ProductError(StarcatError):
 
     exit_code = 5
     product: str | None = None
-    path: Path | None = None
 
 
 class DatabaseMissing(ProductError):  # noqa: N818 - the name reads as the fact
@@ -375,10 +375,7 @@ def no_database(path: Path) -> DatabaseMissing:
     what = "no database is in this folder" if path.is_dir() else "no such database"
     what = "a file, not the folder of a database" if path.is_file() else what
     return DatabaseMissing(
-        what,
-        where=path,
-        path=path,
-        hint="give the folder <name>-<version> that 'starcat build' made",
+        what, where=path, hint="give the folder <name>-<version> that 'starcat build' made"
     )
 
 

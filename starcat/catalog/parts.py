@@ -222,7 +222,7 @@ class FileReading:
         """
         path, digest = self.file.path, self._digest
         if digest is None:
-            raise SourceError("not read to its end", where=path, path=path)
+            raise SourceError("not read to its end", where=path)
         if not self.rows:
             raise self._error(
                 f"no record in the file; expected records of {self.file.source} "

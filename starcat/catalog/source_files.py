@@ -34,7 +34,7 @@ class InputFile:
 
     def error(self, message: str, **fields: Any) -> ParseError:
         """Return an error about the content of the file; ``fields`` are those of `ParseError`."""
-        return ParseError(message, where=self.path, source=self.source, path=self.path, **fields)
+        return ParseError(message, where=self.path, source=self.source, **fields)
 
 
 @dataclass(frozen=True)

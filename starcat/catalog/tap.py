@@ -149,9 +149,7 @@ class _Fetch:
             self.account = _account_in(final, requested)
             lost = [strip.file for strip in self.account.strips if not _is_there(strip, final)]
             if lost:
-                raise OutputError(
-                    f"{lost[0]} is damaged", where=final, path=final, hint="remove the folder"
-                )
+                raise OutputError(f"{lost[0]} is damaged", where=final, hint="remove the folder")
             return "present"
         is_begun = (self.work / ACCOUNT_NAME).is_file()
         self.account = _account_in(self.work, requested) if is_begun else requested
@@ -334,7 +332,6 @@ def _account_in(folder: Path, requested: Account) -> Account:
         raise OutputError(
             f"is there, and has no account of a fetch ({ACCOUNT_NAME})",
             where=folder,
-            path=folder,
             hint="choose another {output}",
         ) from error
     if (account.service, account.query, account.strip_by) != (
@@ -343,7 +340,6 @@ def _account_in(folder: Path, requested: Account) -> Account:
         raise OutputError(
             f"holds what another query gave ({account.query!r} of {account.service})",
             where=folder,
-            path=folder,
             hint=("choose another {output}", "remove it"),
         )
     return account

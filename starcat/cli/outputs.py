@@ -18,13 +18,13 @@ from starcat.errors import OutputError
 
 def _no_file(path: Path | None) -> Path | None:
     if path is not None and path.is_file():
-        raise OutputError("is a file", where=path, path=path, hint="choose a folder with --output")
+        raise OutputError("is a file", where=path, hint="choose a folder with --output")
     return path
 
 
 def _no_folder(path: Path | None) -> Path | None:
     if path is not None and path.is_dir():
-        raise OutputError("is a folder", where=path, path=path, hint="choose a file with --output")
+        raise OutputError("is a folder", where=path, hint="choose a file with --output")
     return path
 
 

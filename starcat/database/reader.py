@@ -51,7 +51,6 @@ class DatabaseFolder:
                 f"no product {product!r}; it has {', '.join(self.products)}",
                 where=self.folder,
                 product=product,
-                path=self.folder,
             )
         path = self.folder / self.manifest["products"][product]["parquet"]
         try:
@@ -61,7 +60,6 @@ class DatabaseFolder:
                 f"cannot be read ({error})",
                 where=path,
                 product=product,
-                path=path,
                 hint="rebuild or fetch the database again",
             ) from error
 

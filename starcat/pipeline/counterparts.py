@@ -180,7 +180,7 @@ def read_star_table(path: Path) -> pa.Table:
             "opens the folder",
         )
     if not path.exists():
-        raise SourceMissing("no such file", where=path, path=path, hint=hint)
+        raise SourceMissing("no such file", where=path, hint=hint)
     with parquet_file(path, ParseError, hint) as file:
         names = file.schema_arrow.names
         check_has_columns(path, names, NEEDED, hint)

@@ -105,7 +105,6 @@ def _same_inputs(old: DatabaseFolder, inputs: Inputs, progress: Progress) -> Inp
                     where=path,
                     source=name,
                     hint=f"Name that file with {{inputs[{name}]}}",
-                    path=path,
                 )
     return inputs_by_source
 

@@ -152,7 +152,6 @@ def _database_of_folder(folder: Path) -> Target:
                 "file of the database",
                 where=folder,
                 product=product,
-                path=folder,
                 hint="fetch or build it again",
             )
         _check_file(path)
@@ -169,16 +168,12 @@ def _check_file(path: Path) -> None:
             is_parquet = begins == file.read(4) == b"PAR1"
     except OSError as error:
         raise ProductError(
-            f"cannot be read ({error.strerror})",
-            where=path,
-            path=path,
-            hint="fetch or build it again",
+            f"cannot be read ({error.strerror})", where=path, hint="fetch or build it again"
         ) from error
     if not is_parquet:
         raise ProductError(
             "not a whole Parquet file (PAR1 at both ends)",
             where=path,
-            path=path,
             hint="fetch or build it again",
         )
 
@@ -215,10 +210,7 @@ def _store(store: Store, engine: Engine) -> Target:
     parts = [(path, part.pixel) for part in store.catalog.partitions for path in part.paths]
     if not parts:
         raise ProductError(
-            "a HATS catalog without a partition",
-            where=store.catalog.folder,
-            path=store.catalog.folder,
-            hint="get it again",
+            "a HATS catalog without a partition", where=store.catalog.folder, hint="get it again"
         )
     stars = _many_files("stars", store.folder, [path for path, _ in parts], engine)
     properties = store.catalog.properties
@@ -250,7 +242,6 @@ def _many_files(name: str, folder: Path, paths: Sequence[Path], engine: Engine) 
                 f"a link to {path.resolve()}, which is not in the store; a query reads "
                 "what is in the folder only",
                 where=path,
-                path=path,
                 hint="Put the file there",
             )
         _check_file(path)
@@ -264,7 +255,7 @@ def _table(path: Path, engine: Engine) -> View:
     except QueryError as error:
         message = str(error).splitlines()[0]
         raise ProductError(
-            f"cannot be read ({message})", where=path, path=path, hint="get the file again"
+            f"cannot be read ({message})", where=path, hint="get the file again"
         ) from error
     name, _, version = schema_name.rpartition("-")
     schema = product_schema(name, version) if schema_name else None

@@ -120,10 +120,7 @@ def whole_file(path: Path) -> Iterator[Path]:
             yield partial
     except OSError as error:
         raise OutputError(
-            f"cannot be written ({reason(error)})",
-            where=path,
-            path=path,
-            hint="choose another {output}",
+            f"cannot be written ({reason(error)})", where=path, hint="choose another {output}"
         ) from error
 
 
@@ -133,7 +130,7 @@ def write_file(path: Path, data: bytes) -> None:
         with placed(path) as partial:
             partial.write_bytes(data)
     except OSError as error:
-        raise OutputError(f"cannot be written ({reason(error)})", where=path, path=path) from error
+        raise OutputError(f"cannot be written ({reason(error)})", where=path) from error
 
 
 @contextmanager
@@ -189,7 +186,6 @@ def whole_folder(final: Path) -> Iterator[Path]:
             raise OutputError(
                 f"cannot write there ({reason(error)})",
                 where=final.parent,
-                path=final.parent,
                 hint="choose another folder with {output}",
             ) from error
         try:
@@ -230,9 +226,7 @@ def writing(folder: Path, hint: str) -> Iterator[None]:
     except OSError as error:
         if error.errno not in _WRITING_FAILED:
             raise
-        raise OutputError(
-            f"writing failed ({reason(error)})", where=folder, path=folder, hint=hint
-        ) from error
+        raise OutputError(f"writing failed ({reason(error)})", where=folder, hint=hint) from error
 
 
 ListFiles = Callable[[Path], Iterable[str]]

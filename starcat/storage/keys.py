@@ -129,8 +129,5 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
             file.write(data)
     except OSError as error:
         raise OutputError(
-            f"cannot be written ({reason(error)})",
-            where=path,
-            path=path,
-            hint="choose another name",
+            f"cannot be written ({reason(error)})", where=path, hint="choose another name"
         ) from error

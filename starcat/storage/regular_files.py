@@ -56,7 +56,7 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
         raise FileMissing("no such file", where=path) from error
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         why = reason(error) if isinstance(error, OSError) else str(error)
-        raise SourceError(f"cannot be read ({why})", where=path, path=path) from error
+        raise SourceError(f"cannot be read ({why})", where=path) from error
     try:
         _check_mode(os.fstat(descriptor).st_mode, path)
     except SourceError:
@@ -72,9 +72,7 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
             size += len(part)
     if size > max_bytes:
         raise SourceError(
-            f"has more than {max_bytes:,} bytes; a file of this kind is smaller",
-            where=path,
-            path=path,
+            f"has more than {max_bytes:,} bytes; a file of this kind is smaller", where=path
         )
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
@@ -82,4 +80,4 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
 def _check_mode(mode: int, path: Path) -> None:
     if not stat.S_ISREG(mode):
         what = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
-        raise SourceError(f"is {what}", where=path, path=path, hint="give a file")
+        raise SourceError(f"is {what}", where=path, hint="give a file")

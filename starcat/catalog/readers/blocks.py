@@ -69,7 +69,7 @@ def open_input(path: Path) -> tuple[DigestReader, io.BufferedIOBase]:
             is_gzip = file.read(2) == GZIP_MAGIC
         raw = DigestReader(path)
     except OSError as error:
-        raise SourceError(f"cannot be read: {error.strerror}", where=path, path=path) from error
+        raise SourceError(f"cannot be read: {error.strerror}", where=path) from error
     buffered = io.BufferedReader(raw, 1 << 20)
     if is_gzip:
         return raw, igzip.IGzipFile(fileobj=buffered)  # type: ignore[no-untyped-call]

@@ -360,7 +360,6 @@ def _read_catalog(folder: Path) -> HatsFolder:
             f"no {' or '.join(PROPERTIES_NAMES)}; expected a HATS catalog, as 'starcat "
             "ingest SOURCE --to hats -o DIR' writes it",
             where=folder,
-            path=folder,
         )
     properties = read_properties(path)
     suffix = properties.get("hats_npix_suffix", ".parquet")
@@ -383,7 +382,6 @@ def pixels_of(folder: Path) -> list[Pixel]:
         raise ProductError(
             f"cannot be read ({error!r}); expected lines of Norder,Npix",
             where=path,
-            path=path,
             hint="Get the catalog again",
         ) from error
 
@@ -403,7 +401,6 @@ def _partition(folder: Path, pixel: Pixel, suffix: str) -> Partition:
         raise ProductError(
             f"partition {pixel.path.as_posix()} is missing; the catalog is not whole",
             where=folder,
-            path=folder,
             hint="Get it again, or make it with 'starcat ingest SOURCE --to hats -o DIR'",
         )
     return Partition(pixel, paths)
@@ -414,7 +411,7 @@ def read_properties(path: Path) -> dict[str, str]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ProductError(f"cannot be read ({error})", where=path, path=path) from error
+        raise ProductError(f"cannot be read ({error})", where=path) from error
     pairs = (line.partition("=") for line in lines if line.strip() and line[0] not in "#!")
     return {key.strip(): value.strip().replace("\\:", ":") for key, _, value in pairs}
 

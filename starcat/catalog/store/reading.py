@@ -223,7 +223,6 @@ def read_store_manifest(store: Store) -> dict[str, Any] | None:
         raise ProductError(
             f"cannot be read ({error!r}); expected the account of a store",
             where=path,
-            path=path,
             hint="Make it again with 'starcat ingest SOURCE --to hats'",
         ) from error
     schema = product_schema("stars")

@@ -76,7 +76,6 @@ class ResumePlan:
             raise OutputError(
                 "an unfinished run is there",
                 where=self.folder,
-                path=self.folder,
                 hint=("continue it with {resume:True}", "remove the folder to start again"),
             )
         if path.is_file():

@@ -183,7 +183,6 @@ def bytes_of_file(path: Path) -> bytes:
         raise DatabaseMissing(
             "does not exist",
             where=path,
-            path=path,
             hint="give an onboard image, as 'starcat export --to onboard' writes it",
         ) from None
     except SourceError as error:

@@ -139,7 +139,6 @@ def tables_of(path: Path) -> NamedTables:
         raise SourceMissing(
             "no such database or file",
             where=path,
-            path=path,
             hint="give the folder of a database or a Parquet file",
         )
     return NamedTables(path.stem, {path.stem: partial(_read_file, path)})
@@ -152,7 +151,6 @@ def _read_file(path: Path) -> pa.Table:
         raise SourceError(
             f"not a readable Parquet file ({error})",
             where=path,
-            path=path,
             hint="give the folder of a database or a Parquet file",
         ) from error
 
@@ -286,7 +284,7 @@ def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_
     if folder.exists() and folder.is_dir() == is_file:
         actual, expected = ("folder", "file") if is_file else ("file", "folder")
         raise OutputError(
-            f"is a {actual}", where=folder, path=folder, hint=f"choose a {expected} with {{output}}"
+            f"is a {actual}", where=folder, hint=f"choose a {expected} with {{output}}"
         )
 
 

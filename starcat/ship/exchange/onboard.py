@@ -162,9 +162,7 @@ def export_image(
     own_camera = None if camera is None else read_camera(Path(camera))
     old = None if patch_from is None else read_onboard_image(Path(patch_from))
     if target.is_dir():
-        raise OutputError(
-            "is a folder", where=target, path=target, hint="choose a file with {output}"
-        )
+        raise OutputError("is a folder", where=target, hint="choose a file with {output}")
     _check_product(opened, method)
     contents = contents_of(check_database(database), method)
     if own_camera is not None:

@@ -121,4 +121,4 @@ def check_blob(path: Path, blob: Blob) -> None:
 
 def damaged_file(path: Path, what: str) -> ProductError:
     """Return the error for a damaged file of a registry."""
-    return ProductError(what, where=path, path=path)
+    return ProductError(what, where=path)

@@ -224,7 +224,6 @@ def _not_ours(path: Path, what: str) -> ProductError:
     return ProductError(
         what,
         where=path,
-        path=path,
         hint="A signed file of this registry was changed, and is not signed again: restore it "
         "from a copy, and find out who can write there",
     )

@@ -186,7 +186,6 @@ def _contents(database: Path) -> tuple[dict[Path, Blob], Listed]:
             "published; expected lower-case letters, digits and hyphens, and a version like "
             "1.10.0 without leading zeros",
             where=path,
-            path=path,
             hint="Change the spec and build again",
         ) from error
 
@@ -203,10 +202,7 @@ def _check_root(root: Path) -> None:
         there = {path.name for path in root.iterdir()} if root.is_dir() else set()
     if there and not there & _PARTS:
         raise OutputError(
-            "neither empty nor a registry",
-            where=root,
-            path=root,
-            hint="publish into a folder of its own",
+            "neither empty nor a registry", where=root, hint="publish into a folder of its own"
         )
 
 
