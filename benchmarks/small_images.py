@@ -61,9 +61,9 @@ def images(folder: Path, place: Path) -> Iterator[tuple[str, ExportedImage]]:
                 )
             except OnboardSizeError:
                 break
-            if len(image.made.data) != last:
+            if len(image.image.data) != last:
                 yield name, image
-            last = len(image.made.data)
+            last = len(image.image.data)
 
 
 def told(image: ExportedImage, name: str, rates: tuple[FlightRates, ...]) -> str:
@@ -80,7 +80,7 @@ def told(image: ExportedImage, name: str, rates: tuple[FlightRates, ...]) -> str
     ]
     fitted = image.fitted
     cells = [
-        name, f"{len(image.made.data):,}", f"{fitted.stars:,}", f"{fitted.features:,}",
+        name, f"{len(image.image.data):,}", f"{fitted.stars:,}", f"{fitted.features:,}",
         identified[0], steps[0], f"{image.voting_bytes:,}", identified[1], steps[1],
     ]  # fmt: skip
     return f"| {' | '.join(cells)} |"
@@ -105,7 +105,7 @@ def main(rows: Rows) -> None:
                     wrong = sum(one.wrong for one in rates)
                     rows.expect(wrong == 0, f"{name}, {image_name}: {wrong} wrong answers")
                     if image.profile == "small":
-                        size = len(image.made.data)
+                        size = len(image.image.data)
                         rows.expect(
                             size <= MAX_BYTES, f"{name}: the small profile has {size:,} bytes"
                         )

@@ -218,7 +218,7 @@ def measure(rows: Rows, name: str, folder: Path, replays: Replays) -> dict[str, 
     method = "pyramid" if profile == "small" else method_of(folder)
     image = replays.folder / f"{name}-{profile}.img"
     exported = export_image(folder, "onboard", image, profile=profile, method=method, replace=True)
-    sky, program = exported.sky, replays.compiled(exported.made.most_near)
+    sky, program = exported.sky, replays.compiled(exported.image.most_near)
     numbers = read_onboard_image(image).star_id
     order, budgets = np.argsort(numbers), {}
     for kind, noise in KINDS.items():

@@ -27,7 +27,7 @@ def reason(error: OSError) -> str:
     return os.strerror(error.errno) if error.errno else str(error)
 
 
-def suggest(word: str, known: Iterable[str]) -> str:
+def suggest(word: str, names: Iterable[str]) -> str:
     """Return the start of a hint if a word is similar to a known word; else an empty text.
 
     People rarely mistype the first letter, so that words which share it can differ by more.
@@ -37,8 +37,8 @@ def suggest(word: str, known: Iterable[str]) -> str:
     >>> suggest("soa", ["sao", "gaia"])
     "did you mean 'sao'? "
     """
-    words = list(known)
-    alike = [one for one in words if one[:1].lower() == word[:1].lower()]
+    words = list(names)
+    alike = [name for name in words if name[:1].lower() == word[:1].lower()]
     near = get_close_matches(word, words, 1, cutoff=0.6) or get_close_matches(word, alike, 1, 0.5)
     return f"did you mean {near[0]!r}? " if near else ""
 

@@ -207,7 +207,7 @@ def _named(source: Path | None) -> Path:
 
 
 def _say_left_out(exported: ExportedImage) -> None:
-    fitted, image = exported.fitted, exported.made
+    fitted, image = exported.fitted, exported.image
     noun = _features(fitted.contents.method)
     why = "to fit" if exported.profile is None else f"by the profile {exported.profile}"
     if fitted.features < fitted.features_before:

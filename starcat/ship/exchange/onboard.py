@@ -56,7 +56,7 @@ class ExportedImage:
 
     Attributes
     ----------
-    made : MadeImage
+    image : MadeImage
         The bytes of the image, and figures of its contents.
     fitted : Shrunk
         Contents of the image, and what was left out.
@@ -78,7 +78,7 @@ class ExportedImage:
         Size of the patch, if one was requested.
     """
 
-    made: MadeImage = field(metadata=entry(is_spread=True))
+    image: MadeImage = field(metadata=entry(is_spread=True))
     fitted: Shrunk = field(metadata=entry(is_spread=True))
     file_format: str = field(metadata=entry(key="format"))
     byte_order: ByteOrder = field(metadata=entry(key="endian"))
@@ -90,14 +90,14 @@ class ExportedImage:
     patch_bytes: int | None = None
 
     def __repr__(self) -> str:
-        stars, size = len(self.made.star_rows), len(self.made.data)
+        stars, size = len(self.image.star_rows), len(self.image.data)
         return f"<ExportedImage {self.files[0]}: {count_of(stars, 'star')}, {size:,} bytes>"
 
     @property
     @in_record()
     def crc(self) -> int:
         """CRC-32 of all data, which flight software needs for a new image."""
-        return crc_of(self.made.data, self.byte_order)
+        return crc_of(self.image.data, self.byte_order)
 
     @property
     def voting_bytes(self) -> int:

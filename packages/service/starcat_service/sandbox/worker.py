@@ -106,8 +106,8 @@ def make_flight_image(
     from starcat.ship.exchange import export_image
 
     options: dict[str, Any] = {"method": method, "endian": endian, "profile": profile}
-    image = export_image(Path(database), "onboard", Path(target), **options)
-    return len(image.made.data)
+    exported = export_image(Path(database), "onboard", Path(target), **options)
+    return len(exported.image.data)
 
 
 def first_camera_confined(folder: str, files: list[str], blind: str) -> dict[str, Any]:
