@@ -45,6 +45,16 @@ def test_a_sequence_is_followed(starcat, small_database, sequence):
         assert names[0] == names[1]
 
 
+def test_a_tracked_sequence_is_corrected_for_aberration(starcat, small_database, sequence):
+    command = ["identify", small_database, sequence, "--time", "2026-11-22T10:00:00", "--json"]
+    tracked = json.loads(starcat([*command, "--track"]).out)
+    assert [answer["origin"] for answer in tracked].count("tracking") == 10
+    for answer, alone in zip(tracked, json.loads(starcat(command).out), strict=True):
+        corrections = [each["in_time"]["correction_arcsec"] for each in (answer, alone)]
+        assert corrections[0] == pytest.approx(corrections[1], abs=0.01)
+        assert 15.0 < corrections[0] < 21.0
+
+
 def test_a_table_of_a_sequence_says_where_frames_were_found(starcat, small_database, sequence):
     lines = starcat(["identify", small_database, sequence, "--track"]).out.splitlines()
     assert sum("tracking" in line for line in lines) == 10
