@@ -9,9 +9,7 @@ from starcat.pipeline.draft import Inputs as Inputs
 from starcat.pipeline.estimate import Estimate as Estimate
 from starcat.pipeline.estimate import EstimateFigures as EstimateFigures
 from starcat.pipeline.estimate import choose_stars as choose_stars
-from starcat.pipeline.estimate import chosen_bytes as chosen_bytes
 from starcat.pipeline.estimate import estimate_draft as estimate_draft
-from starcat.pipeline.estimate import magnitude_range as magnitude_range
 from starcat.pipeline.estimate import read_draft as read_draft
 from starcat.pipeline.estimate import reading_keys as reading_keys
 from starcat.pipeline.guide_stars import MAX_FIELD_STARS as MAX_FIELD_STARS

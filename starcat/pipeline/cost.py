@@ -1,8 +1,8 @@
 """The size of a build before it starts: rows, bytes of files, and memory.
 
 Each product counts its rows (`starcat.database.products.kind`). Files are rows times the width of
-the schema's columns times one factor for each kind of file, measured on databases of 2,400 to
-36,000 stars. Only the free memory depends on the machine. There is no model of time.
+the schema's columns times a factor, measured on databases of 2,400 to 36,000 stars. Only the free
+memory depends on the machine. There is no model of time.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from starcat.storage.schema import product_schema
 
 GIB, MB = 2**30, 1e6
 
-DATABASE_FACTOR = 1.27
-"""Bytes of the HDF5 file, with look-up tables, per byte of the stored columns."""
+FILE_FACTORS = {"database.h5": 1.27, "levels.parquet": 0.1, "radial.parquet": 0.25}
+PARQUET_FACTOR = 0.55
+"""Bytes of a file per byte of its columns without texts (of the HDF5 file with look-up tables),
+measured. Most Parquet files have 0.4 to 0.7; lists of ascending numbers have less."""
 
 REPORT_BYTES, REPORT_BYTES_PER_FIELD = 1.03e6, 98.0
 """Bytes of the report (page and pictures) and the manifest, and additional bytes per field."""
@@ -98,19 +100,16 @@ def product_cost(
     extents = count_products(inputs) if extents is None else extents
     stars, fields = len(inputs.directions), len(inputs.fields.count)
     every = {**extents, **{name: Extent(float(rows)) for name, rows in (others or {}).items()}}
-    files = {
-        f"{name}.parquet": round(
-            _empty_file(name) + PRODUCTS[name].parquet_factor * column_bytes(name, extent)
-        )
-        for name, extent in every.items()
-    }
-    stored = sum(
+    width = {f"{name}.parquet": column_bytes(name, extent) for name, extent in every.items()}
+    width["database.h5"] = sum(
         column_bytes(name, extent, stars) + 8.0 * extent.bins
         for name, extent in extents.items()
         if PRODUCTS[name].in_database
     )
-    files["database.h5"] = round(DATABASE_FACTOR * stored)
-    files["report"] = round(REPORT_BYTES + REPORT_BYTES_PER_FIELD * fields)
+    files = {file: FILE_FACTORS.get(file, PARQUET_FACTOR) * size for file, size in width.items()}
+    for name in every:
+        files[f"{name}.parquet"] += _empty_file(name)
+    files["report"] = REPORT_BYTES + REPORT_BYTES_PER_FIELD * fields
     column_memory = {
         name: COLUMN_FACTOR * column_bytes(name, extents[name]) for name in inputs.requested
     }
@@ -122,7 +121,7 @@ def product_cost(
         {name: round(extents[name].rows) for name in inputs.requested},
         {name: round(column_memory[name] + working[name]) for name in inputs.requested},
         round(memory + FIELD_BYTES * fields),
-        files,
+        {file: round(size) for file, size in files.items()},
     )
 
 

@@ -44,7 +44,6 @@ from starcat.pipeline.guide_stars import (
 from starcat.pipeline.reading import check_sources
 from starcat.pipeline.recipes import field_size
 from starcat.pipeline.report.report import coverage_warnings
-from starcat.pipeline.selection.rules.distrust import Observed
 from starcat.pipeline.selection.rules.magnitude import TOO_FAINT
 from starcat.pipeline.selection.rules.no_magnitude import NO_MAGNITUDE
 from starcat.pipeline.selection.ruleset import ALL_REASONS, Selection
@@ -67,30 +66,20 @@ def read_draft(
     return draft
 
 
-def magnitude_range(stars: pa.Table) -> tuple[float, float] | None:
-    """Return the brightest and the faintest magnitude; None if no star has a magnitude."""
-    mag = floats_of(stars, "mag")
-    finite_mag = mag[mag < np.inf]
-    return (float(finite_mag.min()), float(finite_mag.max())) if len(finite_mag) else None
-
-
 def reading_keys(spec: BuildSpec) -> dict[str, Any]:
     """Return the keys of a spec on which the reading of its catalogs depends."""
     content = spec.model_dump(mode="json")
+    selection, model = content["selection"], content["products"]["crossmatch"]
     keys = {
         "catalog": content["catalog"],
         "epoch_jyear": content["epoch_jyear"],
-        "join": content["selection"]["variables"]["join"],
+        "join": selection["variables"]["join"],
+        "observed": selection["observed"],
+        "response": content["camera"]["response"],
+        "model": {key: model[key] for key in model if key not in ("enabled", "catalogs")},
     }
     if spec.selection.doubles.join:  # the flags depend on the resolution of the sensor
-        keys["doubles"] = content["selection"]["doubles"]
-    if spec.selection.observed != Observed():
-        keys["observed"] = content["selection"]["observed"]
-    if spec.camera.response.name is not None:
-        keys["response"] = content["camera"]["response"]
-    if spec.catalog.motions or spec.catalog.merged or spec.camera.response.photometry:
-        model = content["products"]["crossmatch"]
-        keys["model"] = {key: model[key] for key in model if key not in ("enabled", "catalogs")}
+        keys["doubles"] = selection["doubles"]
     return keys
 
 
@@ -109,17 +98,17 @@ def choose_stars(read: Draft, spec: BuildSpec) -> Draft:
         draft.stars = read.stars.take(pa.array(bright)).combine_chunks()
     run(draft, (select, thin))
     check_tiling(len(draft.selected.guide_stars), spec, None)
-    _check_fields_of_products(len(draft.selected.guide_stars), spec)
+    for section in spec.products.requested.values():
+        count, size = len(draft.selected.guide_stars), field_size(spec)
+        try:
+            section.check_fields(count, spec.boresights.count, size, MAX_FIELD_STARS)
+        except ValueError as error:
+            raise BuildError(
+                f"{spec.name}: too dense to estimate: {error}", key="boresights.count"
+            ) from None
     run(draft, (tile,))
     draft.stars, draft.motions = read.stars.schema.empty_table(), None
     return draft
-
-
-def chosen_bytes(draft: Draft) -> int:
-    """Return the memory that the guide stars of a draft and their fields take."""
-    tables = (draft.selected.guide_stars, draft.selected.rejected)
-    steps = (step.directions for step in draft.selected.steps)
-    return int(draft.fields.nbytes + sum(each.nbytes for each in (*tables, *steps)))
 
 
 def _is_bright(mag: Array, selection: Selection) -> Mask:
@@ -144,17 +133,6 @@ def count_rejected(read: Draft, choice: Draft) -> dict[str, int]:
         for name, count in counts.items():
             totals[name] += count
     return {name: count for name, count in totals.items() if count}
-
-
-def _check_fields_of_products(stars: int, spec: BuildSpec) -> None:
-    """Check the number of stars in the fields of products that have their own tiling."""
-    for section in spec.products.requested.values():
-        try:
-            section.check_fields(stars, spec.boresights.count, field_size(spec), MAX_FIELD_STARS)
-        except ValueError as error:
-            raise BuildError(
-                f"{spec.name}: too dense to estimate: {error}", key="boresights.count"
-            ) from None
 
 
 @dataclass(frozen=True)
@@ -233,26 +211,19 @@ class Estimate:
         """The distribution of stars over the fields."""
         return summarise_coverage(field_coverage(self.fields, self.spec.boresights.brightest))
 
-    @property
-    def enough_share(self) -> float:
-        """Share of the fields with at least `MIN_GUIDE_STARS` stars."""
-        return float((self.fields.count >= MIN_GUIDE_STARS).mean())
-
-    @property
-    def full_share(self) -> float:
-        """Share of the fields with enough stars to fill the list of a field."""
-        return float((self.fields.count >= self.spec.boresights.brightest).mean())
-
-    @property
+    @cached_property
     def figures(self) -> EstimateFigures:
         """The figures that interfaces show."""
-        cost, coverage = self.cost, self.coverage
+        cost, coverage, count = self.cost, self.coverage, self.fields.count
         radec_deg = round(coverage.worst_ra_deg, 6), round(coverage.worst_dec_deg, 6)
         worst = WorstField(coverage.worst_boresight, *radec_deg, coverage.stars.minimum)
-        shares = round(self.enough_share, 6), round(self.full_share, 6)
+        enough_share, full_share = (
+            round(float((count >= stars).mean()), 6)
+            for stars in (MIN_GUIDE_STARS, self.spec.boresights.brightest)
+        )
         return EstimateFigures(
             guide_stars=cost.stars,
-            fields=FieldFigures(cost.fields, coverage.stars, *shares, worst),
+            fields=FieldFigures(cost.fields, coverage.stars, enough_share, full_share, worst),
             filters=[FilterFigures(*each) for each in self.filters],
             rejected=dict(self.rejected),
             rows=dict(cost.rows),
@@ -263,14 +234,6 @@ class Estimate:
             warnings=list(self.warnings),
             in_words=cost.in_words,
         )
-
-    @property
-    def files(self) -> list[tuple[str, int | None, int]]:
-        """Name, rows of a product, and bytes of each file."""
-        cost, rejected = self.cost, sum(self.rejected.values())
-        fixed = {"stars": cost.stars, "boresights": cost.fields, "rejected": rejected}
-        rows = {f"{product}.parquet": count for product, count in {**cost.rows, **fixed}.items()}
-        return [(name, rows.get(name), size) for name, size in cost.files.items()]
 
 
 def estimate_draft(
@@ -288,20 +251,17 @@ def estimate_draft(
     filters = tuple((step.name, len(step.directions)) for step in draft.selected.steps)
     refusals, warnings = tuple(draft.refusals or ()), tuple(draft.warnings)
     estimate = Estimate(spec, draft.cost, draft.fields, filters, rejected, refusals, warnings)
-    of_coverage = coverage_warnings(estimate.coverage, _gap(spec))
-    return replace(estimate, warnings=(*warnings, *of_coverage))
-
-
-def _gap(spec: BuildSpec) -> TilingGap | None:
-    """Return the widest gap of a tiling; None if it has too many fields to compute it."""
-    if spec.boresights.count > MAX_FIELDS_FOR_GAPS:
-        return None
     gap = _widest_gap(spec.boresights.count, spec.selection.region)
-    return replace(gap, tile_radius_rad=tile_radius_rad(field_size(spec)))
+    if gap is not None:
+        gap = replace(gap, tile_radius_rad=tile_radius_rad(field_size(spec)))
+    return replace(estimate, warnings=(*warnings, *coverage_warnings(estimate.coverage, gap)))
 
 
 @lru_cache
-def _widest_gap(boresights: int, region: Region) -> TilingGap:
+def _widest_gap(boresights: int, region: Region) -> TilingGap | None:
+    """Return the widest gap of a tiling; None if it has too many fields to compute it."""
+    if boresights > MAX_FIELDS_FOR_GAPS:
+        return None
     part = region.footprint
     return tiling_gap(spiral_points(boresights, part), 0.0, boresights, part)
 

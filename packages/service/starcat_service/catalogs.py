@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
+import pyarrow.compute as pc
 from cachetools import LRUCache
 from pydantic import BaseModel, Field
 
@@ -27,10 +28,8 @@ from starcat.pipeline import (
     Estimate,
     Starter,
     choose_stars,
-    chosen_bytes,
     enough_limit,
     estimate_draft,
-    magnitude_range,
     read_draft,
     reading_keys,
     starter_spec,
@@ -94,7 +93,7 @@ class Catalogs:
         self._read: LRUCache[str, tuple[Draft, CatalogRead]] = LRUCache(
             READ_BYTES, lambda pair: min(_bytes_of(pair[0]), READ_BYTES)
         )
-        self._choices: LRUCache[Any, Draft] = LRUCache(CHOICE_BYTES, chosen_bytes)
+        self._choices: LRUCache[Any, Draft] = LRUCache(CHOICE_BYTES, _chosen_bytes)
         self._estimates: LRUCache[Any, Estimate] = LRUCache(
             ESTIMATE_BYTES, lambda estimate: estimate.fields.nbytes
         )
@@ -153,8 +152,8 @@ class Catalogs:
         if limits is None:
             read = self.read(spec, key)
             with self._estimating:
-                _, deepest = magnitude_range(read.stars) or (np.inf, np.inf)
-                limits = enough_limit(read.stars, spec), deepest
+                deepest = pc.max(read.stars["mag"]).as_py()
+                limits = enough_limit(read.stars, spec), np.inf if deepest is None else deepest
             self._cache(self._limits, part, limits)
         return limits
 
@@ -293,14 +292,16 @@ def _bytes_of(read: Draft) -> int:
     return int(read.stars.nbytes + (0 if read.motions is None else read.motions.nbytes))
 
 
+def _chosen_bytes(choice: Draft) -> int:
+    """Return the memory that the guide stars of a draft and their fields take."""
+    tables = choice.selected.guide_stars, choice.selected.rejected
+    steps = (step.directions for step in choice.selected.steps)
+    return int(choice.fields.nbytes + sum(each.nbytes for each in (*tables, *steps)))
+
+
 def _facts(spec: BuildSpec, read: Draft) -> CatalogRead:
-    mags = magnitude_range(read.stars)
+    mags = pc.min_max(read.stars["mag"]).as_py()
     band = spec.catalog.band or data_source(spec.catalog.source).bands[0]
     return CatalogRead(
-        spec.catalog.source,
-        band,
-        spec.middle_jyear,
-        len(read.stars),
-        mags and mags[0],
-        mags and mags[1],
+        spec.catalog.source, band, spec.middle_jyear, len(read.stars), mags["min"], mags["max"]
     )

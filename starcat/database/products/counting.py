@@ -40,11 +40,6 @@ class Neighbourhoods:
             self._counts[radius_rad] = self._count(radius_rad)
         return self._counts[radius_rad]
 
-    def between(self, inner_rad: float, outer_rad: float) -> Array:
-        """Return the number of neighbours beyond one radius and within another, shape (M,)."""
-        near = self.within(outer_rad)
-        return near - self.within(inner_rad) if inner_rad > 0.0 else near
-
     def total(self, radius_rad: float) -> float:
         """Return about how many neighbours all stars together have within a radius."""
         return float(len(self._directions) * self.within(radius_rad).mean())

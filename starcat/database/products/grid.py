@@ -102,7 +102,7 @@ def _check(radius_rad: float, buffer_rad: float, cells_per_side: int) -> None:
 def _count(inputs: ProductInputs, section: Grid) -> Extent:
     near, stars = inputs.neighbourhoods, len(inputs.directions)
     radius, cells = inputs.radius_rad(section.radius_deg), section.cells_per_side**2
-    around = near.between(float(np.radians(section.buffer_deg)), radius)
+    around = near.within(radius) - near.within(float(np.radians(section.buffer_deg)))
     # The circle of the neighbours does not fill the square.
     occupied = distinct_cells(around, np.full(1, 4.0 / (np.pi * cells))) * stars
     rows = float(stars * (around > 0.0).mean())

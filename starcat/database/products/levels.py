@@ -237,5 +237,4 @@ KIND = ProductKind(
     ),
     section=Levels,
     count=_count,
-    parquet_factor=0.1,
 )

@@ -100,7 +100,7 @@ def find_pairs(
 def _count(inputs: ProductInputs, section: Pairs) -> Extent:
     near, (least, reach) = inputs.neighbourhoods, section.range_rad(inputs)
     # Each pair is a neighbour of either of its stars.
-    rows = float(0.5 * len(inputs.directions) * near.between(least, reach).mean())
+    rows = float(0.5 * len(inputs.directions) * (near.within(reach) - near.within(least)).mean())
     return Extent(rows, steps=0.5 * near.total(reach))
 
 

@@ -67,30 +67,41 @@ class Preview:
 
 def preview_of(estimate: Estimate, verdict: Verdict) -> Preview:
     """Return the data that the page shows of a spec."""
-    counts = estimate.fields.count.astype(np.int64)
+    figures, counts = estimate.figures, estimate.fields.count.astype(np.int64)
     ra_deg, dec_deg = radec_from_directions(estimate.fields.boresights)
     none = np.zeros_like(counts)
     fields = Fields(ra_deg, dec_deg, counts, none, none)
     is_mapped = len(counts) <= MAX_MAPPED
     return Preview(
         estimate,
-        estimate.figures,
+        figures,
         verdict,
-        sorted(estimate.files, key=lambda file: (-file[2], file[0])),
+        _files(figures),
         _bars(counts),
         sky_map(fields, FIXED_BINS) if is_mapped else None,
         _picture(estimate.fields.boresights, counts, estimate.spec) if is_mapped else "",
     )
 
 
+def _files(figures: EstimateFigures) -> list[tuple[str, int | None, int]]:
+    fixed = {
+        "stars": figures.guide_stars,
+        "boresights": figures.fields.count,
+        "rejected": sum(figures.rejected.values()),
+    }
+    rows = {f"{product}.parquet": count for product, count in {**figures.rows, **fixed}.items()}
+    files = [(name, rows.get(name), size) for name, size in figures.files.items()]
+    return sorted(files, key=lambda file: (-file[2], file[0]))
+
+
 async def verdict_of(estimate: Estimate, catalogs: ChildCatalogs) -> Verdict:
     """Return whether nearly every field has the stars that it needs, and what to do if not."""
-    blind, stars = 1.0 - estimate.enough_share, estimate.coverage.stars
-    spec = estimate.spec
+    fields, spec = estimate.figures.fields, estimate.spec
+    blind, stars = 1.0 - fields.enough_share, fields.stars
     if blind > BLIND_SHARE:
         words = f"{_percent(blind)} of the sky is blind: a frame there has fewer than 4 guide stars"
         advice, test = await _advice(spec, catalogs), spec.self_test
-        hits = round(estimate.enough_share * test.frames)
+        hits = round(fields.enough_share * test.frames)
         if wilson_interval(hits, test.frames)[1] >= test.min_identified:
             return Verdict("bad", f"{words}. {advice}")
         needed = _percent(test.min_identified)
