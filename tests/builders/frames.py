@@ -73,6 +73,16 @@ ENGINES = ["numpy", *(["c"] if is_compiled() else [])]
 
 both_engines = pytest.mark.parametrize("engine", ["numpy", pytest.param("c", marks=needs_c)])
 
+few_in_numpy = pytest.mark.parametrize(
+    ("engine", "count"),
+    [
+        ("numpy", 14),
+        pytest.param("numpy", 40, marks=pytest.mark.slow),
+        pytest.param("c", 40, marks=needs_c),
+    ],
+)
+"""Runs a test of many frames with both engines; numpy has fewer of them in ``make test``."""
+
 
 def agreement_of(
     matrix: np.ndarray,

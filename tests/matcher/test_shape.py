@@ -8,7 +8,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from frames import ARCSEC, agreement_of, both_engines, error_arcsec, observe
+from frames import ARCSEC, agreement_of, both_engines, error_arcsec, few_in_numpy, observe
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -330,11 +330,11 @@ def test_residuals_beyond_the_noise_are_errors_of_the_attitude_as_they_are(sky):
     assert not model_covariance(off, camera, 3, 2.0).any()
 
 
-@both_engines
-def test_a_frame_of_which_a_part_has_another_shape_states_a_larger_error(sky, engine):
+@few_in_numpy
+def test_a_frame_of_which_a_part_has_another_shape_states_a_larger_error(sky, engine, count):
     matcher, camera = Matcher(sky, engine=engine, noise_px=0.3), sky.camera
     answered, off = 0, {"stated": 0, "of noise": 0}
-    for frame in simulate_frames(sky.directions, camera, 40, Noise(0.3), 9, sky.mag):
+    for frame in simulate_frames(sky.directions, camera, count, Noise(0.3), 9, sky.mag):
         q = frame.centroids_px - camera.middle_px
         px = camera.middle_px + np.where(q[:, :1] > 0.0, q * [1.01, 0.99], q)
         is_inside = camera.contains(px)
@@ -350,7 +350,7 @@ def test_a_frame_of_which_a_part_has_another_shape_states_a_larger_error(sky, en
         error = np.abs(error_arcsec(found, frame.matrix))[:2]
         for name, covariance in (("stated", stated), ("of noise", stated - of_model)):
             off[name] += bool((error > 5.0 * np.sqrt(covariance.diagonal()[:2])).any())
-    assert answered >= 34
+    assert answered >= 0.85 * count
     assert off["stated"] <= 0.15 * answered
     assert off["stated"] <= 0.5 * off["of noise"]
 
