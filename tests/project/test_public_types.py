@@ -274,10 +274,11 @@ def test_one_line_tells_what_a_thing_is(small_database, matcher, frames, tmp_pat
     (tmp_path / "one.csv").write_text("x_px,y_px,mag\n1,2,3\n")
     [read] = starcat.read_frames(tmp_path / "one.csv")
     camera = starcat.Camera(1280, 960, 3000.0, principal_point_px=(600, 400), distortion=[0.1] * 5)
-    database = starcat.open(small_database)
+    database, stars = starcat.open(small_database), matcher.identify(frames[0]).stars
     for thing, words in (
         (read, "<MeasuredFrame 'one': 1 centroid with magnitudes>"),
         (matcher.identify(read), "<MatchResult too_few_stars: 1 centroid>"),
+        (stars, f"<MatchedStars: {len(stars)}: {', '.join(stars.star[:3])}, ...>"),
         (database.sql("SELECT count(*) AS n FROM stars"), "<QueryResult: 1 row of n>"),
         (starcat.diff(database, database), "<Difference: same>"),
         (
