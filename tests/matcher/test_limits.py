@@ -84,6 +84,15 @@ def test_the_same_budget_of_steps_gives_the_same_answer(sky, method):
     assert Matcher(sky, method=method, max_steps=100_000).identify(frame.centroids_px).ok
 
 
+def test_a_search_can_take_all_steps_of_its_budget():
+    budget = Budget(max_steps=700)
+    for steps in (300, 400):
+        budget.spend(steps)
+    with pytest.raises(BudgetSpentError, match="steps"):
+        budget.spend(1)
+    assert budget.steps == 700
+
+
 def test_a_limit_of_time_ends_a_search_that_finds_nothing(sky):
     px = np.random.default_rng(0).uniform(0.0, 1024.0, (300, 2))
     result = Matcher(sky, tolerance_px=8.0, time_limit_s=1e-3).identify(px)

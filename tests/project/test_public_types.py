@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import astropy.units as u
@@ -268,6 +269,11 @@ def test_a_batch_has_arrays_and_a_short_repr(matcher, frames):
     many = matcher.identify_many(frames * 10)
     assert many._repr_html_().count("<tr>") == 21
     assert "and 20 more rows" in many._repr_html_()
+
+
+def test_a_frame_counts_its_guide_stars(frames):
+    frame = replace(frames[0], star_index=np.array([0, 3, -1, 7, -1]))
+    assert frame.n_stars == 3
 
 
 def test_one_line_tells_what_a_thing_is(small_database, matcher, frames, tmp_path):
