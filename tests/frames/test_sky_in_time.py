@@ -396,6 +396,13 @@ def test_a_frame_of_another_shape_is_corrected_in_its_shape(random_sky, jupiter_
     assert sky.residual_arcsec == pytest.approx(found.residual_arcsec, abs=0.5)
 
 
+def test_parallaxes_are_one_per_star(random_sky, jupiter_frame):
+    frame, mag, _, _ = jupiter_frame
+    found = identified(random_sky, frame, Observer.at(JUPITER), mag)
+    with pytest.raises(ConfigError, match=r"parallax_mas: shape \(2,\); expected \(1200,\)"):
+        sky_in_time(found, Observer.at(JUPITER), parallax_mas=[1.0, 2.0])
+
+
 def test_an_answer_without_its_frame_says_so(random_sky, jupiter_frame):
     frame, mag, _, _ = jupiter_frame
     observer = Observer.at(JUPITER)

@@ -97,7 +97,7 @@ def test_messages_of_the_library_name_no_option_of_the_command_line():
 
 OF_PYTHON = {
     *("--distortion", "--engine", "--fov-y-deg", "--image", "--max-turn-deg", "--origin"),
-    *("--prior", "--sigma-px", "--time-s", "--x"),
+    *("--parallax-mas", "--prior", "--sigma-px", "--time-s", "--x"),
 }
 """Parameters of functions that no command has; x is a name in a value."""
 
