@@ -111,10 +111,13 @@ class ProductSchema:
             )
         self.check_values(table)
 
-    def check_values(self, table: pa.Table, where: str | None = None, hint: str = "") -> None:
+    def check_values(
+        self, table: pa.Table, where: str | None = None, hint: str = "", *, is_finite: bool = False
+    ) -> None:
         """Check the values of the columns that a table has: their types, and that none is missing.
 
-        Only nullable columns can lack values. NaN and infinity are no values.
+        Only nullable columns can lack values. NaN is no value; infinity is one, such as the radius
+        of the circle through three stars in a line, unless numbers have to be finite.
         """
         import pyarrow.compute as pc
 
@@ -128,7 +131,8 @@ class ProductSchema:
             elif not column.nullable:
                 missing = values.null_count
                 if column.dtype.startswith("float"):
-                    missing += pc.sum(pc.invert(pc.is_finite(values))).as_py() or 0
+                    is_missing = pc.invert(pc.is_finite(values)) if is_finite else pc.is_nan(values)
+                    missing += pc.sum(is_missing).as_py() or 0
                 found = f"{missing} rows have no value"
                 problem = f"{found}; {self.name} allows none" if missing else ""
             if problem:
