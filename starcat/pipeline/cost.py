@@ -24,10 +24,8 @@ from starcat.storage.schema import product_schema
 
 GIB, MB = 2**30, 1e6
 
-FILE_FACTORS = {"database.h5": 1.27, "levels.parquet": 0.1, "radial.parquet": 0.25}
-PARQUET_FACTOR = 0.55
-"""Bytes of a file per byte of its columns without texts (of the HDF5 file with look-up tables),
-measured. Most Parquet files have 0.4 to 0.7; lists of ascending numbers have less."""
+DATABASE_FACTOR = 1.27
+"""Bytes of the HDF5 file, with look-up tables, per byte of the stored columns."""
 
 REPORT_BYTES, REPORT_BYTES_PER_FIELD = 1.03e6, 98.0
 """Bytes of the report (page and pictures) and the manifest, and additional bytes per field."""
@@ -100,15 +98,16 @@ def product_cost(
     extents = count_products(inputs) if extents is None else extents
     stars, fields = len(inputs.directions), len(inputs.fields.count)
     every = {**extents, **{name: Extent(float(rows)) for name, rows in (others or {}).items()}}
-    width = {f"{name}.parquet": column_bytes(name, extent) for name, extent in every.items()}
-    width["database.h5"] = sum(
+    files = {
+        f"{name}.parquet": _empty_file(name)
+        + PRODUCTS[name].parquet_factor * column_bytes(name, extent)
+        for name, extent in every.items()
+    }
+    files["database.h5"] = DATABASE_FACTOR * sum(
         column_bytes(name, extent, stars) + 8.0 * extent.bins
         for name, extent in extents.items()
         if PRODUCTS[name].in_database
     )
-    files = {file: FILE_FACTORS.get(file, PARQUET_FACTOR) * size for file, size in width.items()}
-    for name in every:
-        files[f"{name}.parquet"] += _empty_file(name)
     files["report"] = REPORT_BYTES + REPORT_BYTES_PER_FIELD * fields
     column_memory = {
         name: COLUMN_FACTOR * column_bytes(name, extents[name]) for name in inputs.requested

@@ -185,5 +185,5 @@ def read_star_table(path: Path) -> pa.Table:
         names = file.schema_arrow.names
         check_has_columns(path, names, NEEDED, hint)
         table = file.read([*NEEDED, *(name for name in NUMBERS if name in names)])
-    product_schema("stars").check_values(table, str(path), hint, is_finite=True)
+    product_schema("stars").check_values(table, str(path), hint, must_be_finite=True)
     return table

@@ -76,8 +76,9 @@ def reading_keys(spec: BuildSpec) -> dict[str, Any]:
         "join": selection["variables"]["join"],
         "observed": selection["observed"],
         "response": content["camera"]["response"],
-        "model": {key: model[key] for key in model if key not in ("enabled", "catalogs")},
     }
+    if spec.catalog.motions or spec.catalog.merged or spec.camera.response.photometry:
+        keys["model"] = {key: model[key] for key in model if key not in ("enabled", "catalogs")}
     if spec.selection.doubles.join:  # the flags depend on the resolution of the sensor
         keys["doubles"] = selection["doubles"]
     return keys

@@ -252,12 +252,11 @@ class _Entries:
         star = best["star"].to_numpy()
         # The motion at the epoch of the star's position: the entry moves on a straight line.
         motion = propagate(motion_of(best), self.epoch_jyear[star] - floats_of(best, "epoch_jyear"))
-        has_motion = ~(np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr))
         outcome = best["verdict"].to_numpy(zero_copy_only=False).astype(object)
         is_of_other = best["star_rank"].to_numpy() > 1
         outcome[outcome == "none"] = np.where(is_of_other, "taken", "doubtful")[outcome == "none"]
         named = outcome == "unique"
-        outcome[named] = np.where(has_motion[named], JOINED, NO_MOTION)
+        outcome[named] = np.where(motion.is_known[named], JOINED, NO_MOTION)
         before = self.outcome[star]
         better = (outcome == JOINED) & (before != JOINED) & (before != OWN_MOTION)
         is_new = better | (before == NO_CANDIDATE)

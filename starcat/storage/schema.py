@@ -112,7 +112,12 @@ class ProductSchema:
         self.check_values(table)
 
     def check_values(
-        self, table: pa.Table, where: str | None = None, hint: str = "", *, is_finite: bool = False
+        self,
+        table: pa.Table,
+        where: str | None = None,
+        hint: str = "",
+        *,
+        must_be_finite: bool = False,
     ) -> None:
         """Check the values of the columns that a table has: their types, and that none is missing.
 
@@ -131,7 +136,9 @@ class ProductSchema:
             elif not column.nullable:
                 missing = values.null_count
                 if column.dtype.startswith("float"):
-                    is_missing = pc.invert(pc.is_finite(values)) if is_finite else pc.is_nan(values)
+                    is_missing = (
+                        pc.invert(pc.is_finite(values)) if must_be_finite else pc.is_nan(values)
+                    )
                     missing += pc.sum(is_missing).as_py() or 0
                 found = f"{missing} rows have no value"
                 problem = f"{found}; {self.name} allows none" if missing else ""

@@ -33,8 +33,7 @@ class Positions:
         """Return the positions in the columns of a table."""
         motion = motion_of(stars)
         directions = directions_from_radec(motion.ra_deg, motion.dec_deg)
-        has_motion = ~np.isnan(motion.pm_ra_cosdec_mas_yr) & ~np.isnan(motion.pm_dec_mas_yr)
-        return cls(directions, floats_of(stars, "epoch_jyear"), motion, has_motion)
+        return cls(directions, floats_of(stars, "epoch_jyear"), motion, motion.is_known)
 
     def at(
         self, epoch_jyear: Array | float, rows: NDArray[np.int64] | slice = slice(None)

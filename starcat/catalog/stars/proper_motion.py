@@ -14,7 +14,7 @@ import erfa
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Mask
 from starcat.geometry.sphere import directions_from_radec
 
 MAS = np.pi / (180.0 * 3600.0 * 1000.0)  # rad in a milliarcsecond
@@ -29,6 +29,11 @@ class Motion:
     pm_ra_cosdec_mas_yr: Array  # NaN where either motion is unknown
     pm_dec_mas_yr: Array
 
+    @property
+    def is_known(self) -> Mask:
+        """Which stars have a proper motion on both axes, shape (N,)."""
+        return ~(np.isnan(self.pm_ra_cosdec_mas_yr) | np.isnan(self.pm_dec_mas_yr))
+
 
 def propagate(motion: Motion, years: ArrayLike) -> Motion:
     """Move positions by a number of Julian years.
@@ -42,7 +47,7 @@ def propagate(motion: Motion, years: ArrayLike) -> Motion:
 
 def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Array]:
     """Move positions as `propagate` does, and return the directions too."""
-    unknown = np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr)
+    unknown = ~motion.is_known
     pm_ra = np.where(unknown, 0.0, motion.pm_ra_cosdec_mas_yr) * MAS
     pm_dec = np.where(unknown, 0.0, motion.pm_dec_mas_yr) * MAS
     elapsed = np.asarray(years, dtype=np.float64)

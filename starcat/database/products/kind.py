@@ -149,6 +149,9 @@ class ProductKind:
     own_layout: ProductLayout = field(default_factory=ProductLayout)
     # Counts it without making it. None if the rows cannot be counted from guide stars.
     count: Callable[[ProductInputs, Any], Extent] | None = row_per_star
+    # Bytes of its Parquet file per byte of its columns without texts, measured. Most files have 0.4
+    # to 0.7; lists of ascending numbers have less.
+    parquet_factor: float = 0.55
     # Yields contradictions in the tables of the product and of the stars.
     problems: Callable[[pa.Table, pa.Table], Iterator[str]] | None = None
     # Counts the stars for which the product uses a catalog; and what these stars have, in words.

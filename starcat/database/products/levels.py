@@ -237,4 +237,5 @@ KIND = ProductKind(
     ),
     section=Levels,
     count=_count,
+    parquet_factor=0.1,
 )

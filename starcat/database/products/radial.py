@@ -106,4 +106,4 @@ def _count(inputs: ProductInputs, section: Radial) -> Extent:
     return Extent(float(stars), {"rings": occupied}, rings, near.total(radius))
 
 
-KIND = ProductKind(name="radial", make=_make, section=Radial, count=_count)
+KIND = ProductKind(name="radial", make=_make, section=Radial, count=_count, parquet_factor=0.25)
