@@ -2,13 +2,14 @@
 
     python benchmarks/engines.py [--frames 20000] [--workers 2] [--folder FOLDER]
 
-Frames are of the kinds of ``false_frames.py``, and clean, hard, few and crowded ones, each with its
-own tolerance or noise, with magnitudes or without, with the focal length known or not, from the
-whole sky or near a prior. Status, stars, a fitted focal length, and the reason of a refusal are
-compared. Three kinds of frames do not count as differences: frames whose probability of chance is
-within 10 % of the accepted probability, by its logarithm; frames on which a limit of steps ended
-one of the searches, because the two count steps differently; and frames with two right answers,
-such as two exposures in one frame, which have their own column.
+Frames are of the kinds of ``false_frames.py``; with another shape than the camera's, of
+``shapes.py``; and clean, hard, few and crowded ones. Each has its own tolerance or noise, with
+magnitudes or without, with the focal length known or not, from the whole sky or near a prior.
+Status, stars, a fitted focal length, and the reason of a refusal are compared. Three kinds of
+frames do not count as differences: frames whose probability of chance is within 10 % of the
+accepted probability, by its logarithm; frames on which a limit of steps ended one of the searches,
+because the two count steps differently; and frames with two right answers, such as two exposures in
+one frame, which have their own column.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from false_frames import KINDS, NO_SKY, Scene, Trial
 from false_matches import NOISE_MAG, STATED, databases, matcher_of
 from judging import judge_answer
 from rows import Options, Rows, ended
+from shapes import KINDS as SHAPES
+from shapes import NOISE as NOISE_OF_SHAPES
 
 from starcat.geometry.attitude import after_turn, quaternion_from_matrix
 from starcat.matcher.matcher import Matcher
@@ -50,6 +53,8 @@ ORDINARY = {
     "crowded": Noise(0.3, 0.5, 40, noise_mag=0.3),
 }
 
+OTHER_SHAPES = {kind: NOISE_OF_SHAPES for kind in SHAPES if kind not in ("as stated", "mirrored")}
+
 
 @dataclass(frozen=True)
 class Job:
@@ -65,11 +70,16 @@ def made(kind: str, generator: np.random.Generator, scene: Scene) -> Trial:
     """Return a frame of a kind."""
     if kind in KINDS:
         return KINDS[kind](generator, scene)
-    database, seed = scene.database, int(generator.integers(1 << 31))
-    given = database.directions, database.camera, 1, ORDINARY[kind], seed, database.mag
-    [frame] = simulate_frames(*given)
-    mag = frame.mag if generator.random() < 0.5 else None
-    return Trial(frame.centroids_px, mag, (frame.matrix,), noise_px=ORDINARY[kind].noise_px)
+    noise, database = (ORDINARY | OTHER_SHAPES)[kind], scene.database
+    seed, camera = int(generator.integers(1 << 31)), database.camera
+    [frame] = simulate_frames(database.directions, camera, 1, noise, seed, database.mag)
+    px, mag = frame.centroids_px, frame.mag
+    if kind in OTHER_SHAPES:
+        px = camera.middle_px + SHAPES[kind](px - camera.middle_px, camera, generator)
+        inside = camera.contains(px)
+        px, mag = px[inside], mag[inside]
+    with_mag = generator.random() < 0.5
+    return Trial(px, mag if with_mag else None, (frame.matrix,), noise_px=noise.noise_px)
 
 
 def difference(
@@ -155,7 +165,7 @@ def main(rows: Rows) -> None:
     options.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     options.add_argument("--folder", type=Path, help="where the databases are, or will be")
     asked = options.asked()
-    kinds = [*ORDINARY, *KINDS]
+    kinds = [*ORDINARY, *KINDS, *OTHER_SHAPES]
     # Frames without a sky take numpy its whole search: fewer of them.
     parts = [0.25 if kind in NO_SKY else 1.0 for kind in kinds]
     each = asked.frames / sum(parts)
