@@ -83,10 +83,6 @@ struct starcat_workspace {
   int16_t before[STARCAT_MAX_CENTROIDS];
   starcat_real match_square[STARCAT_MAX_CENTROIDS];
 
-  /* Centroids without a star near the star of another centroid, and that other centroid. */
-  uint16_t rival[STARCAT_MAX_CENTROIDS];
-  uint16_t rival_of[STARCAT_MAX_CENTROIDS];
-
   /* Stars that each centroid can be by its magnitude; bounds of the ways to assign n of them. */
   uint16_t compatible[STARCAT_MAX_CENTROIDS];
   starcat_real log_ways[STARCAT_MAX_CENTROIDS + 1];

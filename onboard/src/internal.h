@@ -31,15 +31,11 @@
 #define STARCAT_MIN_STARS 4u
 #define STARCAT_REACH R(1.5)         /* largest distance of a match, in tolerances */
 #define STARCAT_FOCAL_MARGIN R(0.02) /* added to the field's radius if the focal length is fitted */
-#define STARCAT_OVER_CHANCE \
-  R(2.0) /* centroids within a smaller reach, relative to its share of the area */
 #define STARCAT_CURVATURE (R(2.0) / R(3.0))
 #define STARCAT_REFINEMENTS 4u
 #define STARCAT_STEPS_FROM_AFAR 16u /* of Newton's method, from a rough or damaged attitude */
 #define STARCAT_LOG_LIKELY \
   R(-6.907755278982137)               /* logarithm of 1e-3: the attitude is likely, not certain */
-#define STARCAT_LOG_ROUNDING R(1e-4)  /* logarithms of chances that differ by less count as equal */
-#define STARCAT_RIVAL_REACH R(4.0)    /* largest distance of a rival from a star, in reaches */
 #define STARCAT_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
 #define STARCAT_WIDER_RANGE R(2.0)    /* a scale outside of its range is searched this far */
 #define STARCAT_UNKNOWNS (3u + STARCAT_SHAPE_TERMS) /* of a fit: three angles, and a shape */

@@ -7,8 +7,6 @@
  *             match centroids and stars that are nearest to each other
  *             refine the attitude on them
  *         judge: bound the probability that chance matches as many as well  [chance.c]
- *         if it is not due to chance: give stars to competing centroids that fit better
- *         if it is not certain: fit again with a smaller radius of matching
  *         if its residuals are not those of noise, or much of the frame is
  *         unexplained: fit again with a shape of the frame  [shape.c]
  *             withhold it if its stars do not determine the boresight whatever the shape is
@@ -30,6 +28,8 @@
 #define SHAPE_CHANCE R(1e-4)
 #define SHAPE_STEPS 2u
 #define LEAST_NOISE_PX R(1e-3) /* noise below which residuals show no shape */
+#define DOUBLED_FOR_SCALE 1u   /* how often the first reach is doubled to fit a focal length */
+#define DOUBLED_FOR_SHAPE 2u   /* the same to fit a shape */
 #define FREE_TERMS 4u          /* with which the stars of an answer must determine the boresight */
 
 /* Whether the magnitudes of a centroid and a star are compatible. */
@@ -145,18 +145,27 @@ static void add_information(information *h, const real b[3]) {
   h->scale += square * (R(1.0) - square);
 }
 
-/* Refine the attitude on pairs of directions, and also the focal length if its error can be above
- * 0. This is one step of Newton's method; `icrs` belongs to the centroids that `of` lists. */
-static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, const real *icrs,
-                         const uint16_t *which, uint32_t n) {
+/* Refine the attitude on all matches, and also the focal length if its error can be above 0. This is
+ * one step of Newton's method. */
+static void refine_matched(starcat_call *call, real m[9]) {
+  const starcat_workspace *w = call->work;
+  uint16_t which[STARCAT_MAX_CENTROIDS], of[STARCAT_MAX_CENTROIDS];
   real body[STARCAT_MAX_CENTROIDS][3];
+  uint32_t n = 0;
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    if (w->match[i] >= 0) {
+      which[n] = (uint16_t)starcat_find_near(w, starcat_find_match(w, i));
+      of[n] = (uint16_t)i;
+      n++;
+    }
+  }
   if (call->fov_error > R(0.0)) {
     information h = {{0}, {0}, R(0.0)};
     real turn[3] = {0}, shrink = R(0.0), along[3], unused[6], step = R(0.0);
     for (uint32_t i = 0; i < n; i++) {
       const real *b = call->body[of[i]];
       real a[3], left[3], moved[3];
-      starcat_turn(m, icrs + 3u * (which != NULL ? which[i] : i), a);
+      starcat_turn(m, w->near_icrs[which[i]], a);
       for (uint32_t k = 0; k < 3u; k++) {
         left[k] = b[k] - a[k];
       }
@@ -188,33 +197,8 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
     body[i][1] = call->body[of[i]][1];
     body[i][2] = call->body[of[i]][2];
   }
-  starcat_refine_attitude(m, &body[0][0], icrs, which, NULL, n, 4);
+  starcat_refine_attitude(m, &body[0][0], &w->near_icrs[0][0], which, NULL, n, 4);
 }
-
-/* Refine the attitude on all matches. */
-static void refine_matched(starcat_call *call, real m[9]) {
-  const starcat_workspace *w = call->work;
-  uint16_t which[STARCAT_MAX_CENTROIDS], of[STARCAT_MAX_CENTROIDS];
-  uint32_t n = 0;
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    if (w->match[i] >= 0) {
-      which[n] = (uint16_t)starcat_find_near(w, starcat_find_match(w, i));
-      of[n] = (uint16_t)i;
-      n++;
-    }
-  }
-  refine_pairs(call, m, of, &w->near_icrs[0][0], which, n);
-}
-
-/* Reaches of a refinement, in units of the final reach: `first` once each, then `last`. */
-typedef struct {
-  uint32_t count;
-  real first[3];
-  real last;
-} reaches;
-
-static const reaches AS_GIVEN = {0, {0}, R(1.0)};
-static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)}; /* with a shape */
 
 /* Gather the stars around the field of an attitude. Returns 0 if there are too many, or if the
  * budget is used up. */
@@ -251,10 +235,11 @@ static int refine_shape(starcat_call *call, real m[9], uint32_t free, real *term
          (starcat_take_step(call, &step, free, m, terms) != 0);
 }
 
-/* Refine an attitude, and the first `free` terms of a shape, on all stars that match. Returns the
- * number of matches; 0 if there are too many stars around the field, if the budget is used up, or
- * if the fit of the shape runs away. */
-static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r, uint32_t free,
+/* Refine an attitude, and the first `free` terms of a shape, on all stars that match. The first reach
+ * is doubled `doubled` times, and halved with each refinement. Returns the number of matches; 0 if
+ * there are too many stars around the field, if the budget is used up, or if the fit of the shape
+ * runs away. */
+static uint32_t fit_matches(starcat_call *call, real m[9], uint32_t doubled, uint32_t free,
                             real *terms) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
@@ -264,16 +249,15 @@ static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r, uin
   for (uint32_t i = 0; i < call->own->count; i++) {
     w->before[i] = -2;
   }
-  for (uint32_t n = 0; n < r->count + STARCAT_REFINEMENTS; n++) {
-    const int is_final = n >= r->count;
-    const real factor = is_final ? r->last : r->first[n];
-    starcat_project_stars(call, m,
-                          starcat_larger(factor, R(1.0)) * call->reach_px + call->margin_px);
+  for (uint32_t n = 0; n < doubled + STARCAT_REFINEMENTS; n++) {
+    const int is_final = n >= doubled;
+    const real reach_px = is_final ? call->reach_px : (real)(1u << (doubled - n)) * call->reach_px;
+    starcat_project_stars(call, m, reach_px + call->margin_px);
     if (!starcat_spend_steps(call,
                              call->own->n_near + call->own->count * (call->own->n_within + 1u))) {
       return 0;
     }
-    matched = match_stars(call, factor * call->reach_px);
+    matched = match_stars(call, reach_px);
     if (!starcat_spend_steps(call, STEPS_OF_MATCH * matched)) {
       return 0;
     }
@@ -353,123 +337,10 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
   found->log_chance = found->log_bound;
 }
 
-/* List the centroids without a star that are near the star of another centroid. */
-static uint32_t find_rivals(const starcat_call *call) {
-  starcat_workspace *w = call->work;
-  const real reach_px = STARCAT_RIVAL_REACH * call->reach_px;
-  uint32_t n = 0;
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    real least = reach_px * reach_px;
-    uint32_t of = call->own->count;
-    for (uint32_t k = 0; (k < call->own->count) && (w->match[i] < 0); k++) {
-      if (w->match[k] >= 0) {
-        const uint32_t star = starcat_find_match(w, k);
-        const real dx = call->x[i] - w->x_of[star], dy = call->y[i] - w->y_of[star];
-        const real square = dx * dx + dy * dy;
-        if (square < least) {
-          least = square;
-          of = k;
-        }
-      }
-    }
-    if ((of < call->own->count) &&
-        starcat_is_compatible(call, i,
-                              w->near_row[starcat_find_near(w, starcat_find_match(w, of))])) {
-      w->rival[n] = (uint16_t)i;
-      w->rival_of[n] = (uint16_t)of;
-      n++;
-    }
-  }
-  return n;
-}
-
-/* Give the star of a centroid to its rival, and fit the attitude to the new pairs. */
-static void fit_rival(starcat_call *call, uint32_t rival, uint32_t centroid, real m[9]) {
-  const starcat_workspace *w = call->work;
-  real icrs[STARCAT_MAX_CENTROIDS][3];
-  uint16_t of[STARCAT_MAX_CENTROIDS];
-  uint32_t n = 0;
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    const uint32_t owner = i == rival ? centroid : i;
-    if ((i != centroid) && (w->found.star[owner] >= 0)) {
-      starcat_read_star(call->image,
-                        starcat_limit_place((uint32_t)w->found.star[owner], call->image->n_stars),
-                        icrs[n]);
-      of[n] = (uint16_t)i;
-      n++;
-    }
-  }
-  refine_pairs(call, m, of, &icrs[0][0], NULL, n);
-}
-
-/* Restart from the attitude and the focal length of an agreement. */
-static void restore_agreement(starcat_call *call, const starcat_agreement *from, real m[9]) {
-  for (uint32_t k = 0; k < 9u; k++) {
-    m[k] = from->matrix[k];
-  }
-  (void)starcat_set_focal(call, from->focal);
-}
-
-/* A false spot close to a star that is far from the others can turn the attitude so that the spot
- * is nearest to the star. The star's own spot then has no star, but fits better: take the first
- * rival that does. */
-static void try_rivals(starcat_call *call) {
-  starcat_workspace *w = call->work;
-  const uint32_t count = find_rivals(call);
-  for (uint32_t n = 0; n < count; n++) {
-    real m[9];
-    if (!starcat_spend_steps(call, STEPS_OF_MATCH * w->found.n_matched)) {
-      return;
-    }
-    restore_agreement(call, &w->found, m);
-    fit_rival(call, w->rival[n], starcat_limit_place(w->rival_of[n], STARCAT_MAX_CENTROIDS), m);
-    judge_fit(call, m, fit_matches(call, m, &AS_GIVEN, 0, NULL), 0, NULL, &w->wider);
-    /* The fit can return to the first attitude, except for rounding. */
-    if (w->wider.log_chance < w->found.log_chance - STARCAT_LOG_ROUNDING) {
-      w->found = w->wider;
-      return;
-    }
-  }
-}
-
 /* Whether agreement a is better than b; withheld agreements are compared by their bounds. */
 static int is_better(const starcat_agreement *a, const starcat_agreement *b) {
   return (a->log_chance < b->log_chance) ||
          (!(b->log_chance < a->log_chance) && (a->log_bound < b->log_bound));
-}
-
-/* Count the matched centroids within smaller reaches, each half of the previous one. If nothing
- * matched, the distances can be unknown: count nothing. */
-static void count_nearer(const starcat_call *call, uint32_t matched, uint32_t nearer[3]) {
-  const starcat_workspace *w = call->work;
-  for (uint32_t k = 0; k < 3u; k++) {
-    const real reach = call->reach_px / (real)(2u << k);
-    nearer[k] = 0;
-    for (uint32_t i = 0; (i < call->own->count) && (matched > 0u); i++) {
-      nearer[k] += (uint32_t)((w->match[i] >= 0) && (w->match_square[i] <= reach * reach));
-    }
-  }
-}
-
-/* Try smaller reaches if more centroids are near their stars than chance explains. If centroids are
- * more accurate than the tolerance, chance puts more false matches within the reach of a crowded
- * frame than it has true stars. */
-static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t count) {
-  starcat_workspace *w = call->work;
-  reaches r = {0, {R(0.5), R(0.25), R(0.125)}, R(1.0)};
-  for (uint32_t k = 0; k < 3u; k++) {
-    r.count = k;
-    r.last = r.first[k];
-    if ((nearer[k] >= STARCAT_MIN_STARS) &&
-        ((real)nearer[k] >= STARCAT_OVER_CHANCE * r.last * r.last * (real)count)) {
-      real m[9];
-      restore_agreement(call, &w->found, m);
-      judge_fit(call, m, fit_matches(call, m, &r, 0, NULL), 0, NULL, &w->wider);
-      if (is_better(&w->wider, &w->found) != 0) {
-        w->found = w->wider;
-      }
-    }
-  }
 }
 
 /* Whether an agreement is certain, with residuals of noise and most of the frame: then no shape is
@@ -527,7 +398,7 @@ static void try_shapes(starcat_call *call) {
     } else {
       good = use_agreement(call, &w->start, terms);
     }
-    const uint32_t matched = good != 0 ? fit_matches(call, m, &WIDER, free, terms) : 0u;
+    const uint32_t matched = good != 0 ? fit_matches(call, m, DOUBLED_FOR_SHAPE, free, terms) : 0u;
     if ((matched > 0u) || (free == 0u)) {
       judge_fit(call, m, matched, free, terms, &w->wider);
       allot_chance(&w->wider, free);
@@ -759,7 +630,7 @@ int starcat_try_shape(starcat_call *call, real m[9], const uint32_t triple[3], c
     body[k] = call->body[triple[k / 3u]][k % 3u];
   }
   starcat_refine_attitude(m, body, icrs, NULL, NULL, 3, 2);
-  judge_fit(call, m, fit_matches(call, m, &WIDER, FREE_TERMS, terms), FREE_TERMS, terms,
+  judge_fit(call, m, fit_matches(call, m, DOUBLED_FOR_SHAPE, FREE_TERMS, terms), FREE_TERMS, terms,
             &call->work->found);
   if (!(call->work->found.log_bound < R(0.0))) {
     return 0;
@@ -771,11 +642,7 @@ int starcat_try_shape(starcat_call *call, real m[9], const uint32_t triple[3], c
 /* Try an attitude with a multiple of the given focal length. Returns whether the search ends: the
  * answer is certain, or the steps are used up. */
 int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
-  static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
-  starcat_workspace *w = call->work;
-  starcat_agreement *found = &w->found;
-  const int is_scaled = call->fov_error > R(0.0);
-  uint32_t nearer[3];
+  const uint32_t doubled = call->fov_error > R(0.0) ? DOUBLED_FOR_SCALE : 0u;
   real attitude[9];
   for (uint32_t k = 0; k < 9u; k++) {
     attitude[k] = m[k];
@@ -785,15 +652,7 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
     return 1;
   }
   (void)starcat_set_focal(call, focal);
-  judge_fit(call, attitude, fit_matches(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN, 0, NULL), 0,
-            NULL, found);
-  const uint32_t count = found->n_matched;
-  count_nearer(call, count, nearer);
-  if (found->log_chance < R(0.0)) {
-    try_rivals(call);
-  }
-  if (!(found->log_chance <= call->log_certain)) {
-    try_nearer(call, nearer, count);
-  }
+  judge_fit(call, attitude, fit_matches(call, attitude, doubled, 0, NULL), 0, NULL,
+            &call->work->found);
   return settle_agreement(call);
 }

@@ -72,8 +72,8 @@ static void check_lens(void) {
   CHECK_NEAR(y, unit_work.y[0], 1e-3);
 }
 
-/* A false spot close to a star's spot: the one that fits is found. */
-static void check_rivals(void) {
+/* A false spot close to a star's spot is rarely taken for the star. */
+static void check_beside(void) {
   uint64_t state = 73;
   uint32_t found = 0, wrong = 0;
   for (uint32_t n = 0; n < 40u; n++) {
@@ -91,7 +91,7 @@ static void check_rivals(void) {
       wrong += unit_wrong_stars(&truth);
       found++;
     }
-    /* The steps can run out at the rival, whose fit takes some. */
+    /* The steps can run out anywhere. */
     const uint32_t enough = unit_result.steps;
     for (uint32_t fewer = 1; (fewer < 1500u) && (fewer < enough); fewer += 60u) {
       unit_scratch.options.max_steps = enough - fewer;
@@ -267,7 +267,7 @@ void test_scale(void) {
   unit_copy(&unit_triangle);
   check_found();
   check_lens();
-  check_rivals();
+  check_beside();
   check_wide();
   check_near();
   check_other_scales();

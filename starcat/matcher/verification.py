@@ -66,25 +66,11 @@ The other models of `MODELS` have equal shares of the rest."""
 SHAPE_CHANCE = 1e-4
 """A frame has the shape that fits it best if noise lowers the residuals as much less often."""
 
-NARROWER = (0.5, 0.25, 0.125)
-"""Smaller reaches that are tried if an agreement is not certain, in units of the final reach."""
-
-OVER_CHANCE = 2.0
-"""A smaller reach is tried if it holds this many times the centroids that its area would have by
-chance."""
-
-RIVAL_REACH = 4.0
-"""A centroid without a star competes for a star of another centroid if it is this near to it; in
-units of the final reach."""
-
 LEAST_NOISE_PX = 1e-3
 """Noise below which residuals show no shape: stars of a database are rounded."""
 
 SHAPE_STEPS = 2
 """Steps of the fit of a shape to stars that are known."""
-
-ROUNDING = 1e-4
-"""Largest relative difference of probabilities that differ only by rounding."""
 
 ROUGH = (2.0,)
 """Reach of a first refinement if the focal length is fitted too, in units of the final reach:
@@ -254,19 +240,7 @@ def agree(
 ) -> Agreement:
     """Match the centroids of a frame with the stars that an attitude predicts."""
     rough = ROUGH if observation.fov_error and not first else first
-    refined = _refine(pose, observation, database, rough)
-    agreement = _agreement_of(refined, observation)
-    if agreement.false_match_probability < 1.0:
-        # A false spot beside a star far from the others can turn the attitude so that it is the
-        # nearest to the star itself. The star's own spot then has no star, and fits better.
-        for rival, centroid in _rivals(refined, observation):
-            other = _with_rival(agreement, rival, centroid, observation, database)
-            # The fit can lead back to its start; a difference by rounding is not progress.
-            if other.false_match_probability < (1.0 - ROUNDING) * agreement.false_match_probability:
-                agreement = other
-                break
-    if agreement.false_match_probability > certain:
-        agreement = _within_less(agreement, refined, observation, database)
+    agreement = _agreement_of(_refine(pose, observation, database, rough), observation)
     return _with_shape(agreement, observation, database, certain)
 
 
@@ -418,59 +392,6 @@ def _residual_rad(pose: Pose, matched: Rows, stars: Directions) -> float:
     return math.sqrt(float(np.vdot(difference, difference)) / len(matched))
 
 
-def _within_less(
-    agreement: Agreement, refined: _Fit, observation: Observation, database: MatcherDatabase
-) -> Agreement:
-    """Return the best agreement within smaller reaches.
-
-    They are tried if more centroids are near their stars than chance would bring there. The
-    tolerance is the largest error that is allowed. If centroids are more accurate, chance puts
-    more false stars than true ones within its reach in a crowded frame. The bound holds for
-    every number of matched stars, so it can be taken at the best number.
-    """
-    square_px, count = refined.square_px[refined.matched], len(refined.matched)
-    for k, factor in enumerate(NARROWER):
-        near = int(np.sum(square_px <= (factor * REACH * observation.tolerance_px) ** 2))
-        if near < MIN_STARS or near < OVER_CHANCE * factor * factor * count:
-            continue
-        narrow = _refine(agreement.pose, observation, database, NARROWER[:k], factor)
-        other = _agreement_of(narrow, observation)
-        if other.is_better_than(agreement):
-            agreement = other
-    return agreement
-
-
-def _rivals(refined: _Fit, observation: Observation) -> list[tuple[int, int]]:
-    """Return centroids without a star, each with the centroid that took its nearest star."""
-    loose, matched = (refined.star < 0).nonzero()[0], refined.matched
-    reach_px = RIVAL_REACH * REACH * observation.tolerance_px
-    if not len(loose) or not len(matched) or refined.square_px[loose].min() >= reach_px * reach_px:
-        return []
-    star = refined.star[matched]
-    offset = refined.pose.px[loose][:, None] - refined.predicted_px[star]
-    offset *= offset
-    square = offset[..., 0] + offset[..., 1]
-    nearest = square.argmin(axis=1)
-    near = square[np.arange(len(loose)), nearest] < reach_px * reach_px
-    if refined.compatible is not None:
-        near &= refined.compatible[loose, star[nearest]]
-    return list(zip(loose[near].tolist(), matched[nearest[near]].tolist(), strict=True))
-
-
-def _with_rival(
-    agreement: Agreement,
-    rival: int,
-    centroid: int,
-    observation: Observation,
-    database: MatcherDatabase,
-) -> Agreement:
-    index = agreement.star_index.copy()
-    index[rival], index[centroid] = index[centroid], -1
-    matched = np.flatnonzero(index >= 0)
-    pose = fit(agreement.pose, matched, database.directions[index[matched]], observation)
-    return _agreement_of(_refine(pose, observation, database), observation)
-
-
 @dataclass(frozen=True)
 class _Fit:
     """A pose, the stars around its field, and the star of each centroid."""
@@ -483,7 +404,6 @@ class _Fit:
     star: Rows  # row of ``near`` for each centroid, -1 without a star
     matched: Rows  # centroids with a star
     square_px: Array
-    last: float  # the last reach, in units of the final one
 
 
 def _refine(
@@ -491,10 +411,9 @@ def _refine(
     observation: Observation,
     database: MatcherDatabase,
     wider: tuple[float, ...] = (),
-    last: float = 1.0,
     free: int = 0,
 ) -> _Fit:
-    """Refine a pose on all stars that match, first within other reaches than the last one.
+    """Refine a pose on all stars that match, first within wider reaches than the final one.
 
     With ``free`` terms of a shape; if that fit runs away, no centroid has a star.
     """
@@ -509,11 +428,10 @@ def _refine(
     u = database.directions[near]
     compatible = observation.compatible(database.mag[near])
     before: list[int] = []
-    for step, factor in enumerate((*wider, *MAX_REFINEMENTS * (last,))):
+    for step, factor in enumerate((*wider, *MAX_REFINEMENTS * (1.0,))):
         predicted = pose.camera.pixels_from_directions(u @ pose.matrix.T)
         reach_px = factor * REACH * observation.tolerance_px
-        beyond_px = max(factor, 1.0) * REACH * observation.tolerance_px
-        beyond_px += margin_px(pose.shape.terms, pose.camera)
+        beyond_px = reach_px + margin_px(pose.shape.terms, pose.camera)
         predicted[~is_near_frame(predicted, pose.camera, beyond_px)] = np.nan
         star, square_px = _mutually_nearest(predicted, pose.px, reach_px, compatible)
         matched, after = (star >= 0).nonzero()[0], star.tolist()
@@ -529,7 +447,7 @@ def _refine(
             star, matched = np.full_like(star, -1), matched[:0]
             break
         pose = fitted
-    return _Fit(pose, near, u, compatible, predicted, star, matched, square_px, last)
+    return _Fit(pose, near, u, compatible, predicted, star, matched, square_px)
 
 
 def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agreement:

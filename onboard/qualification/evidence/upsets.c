@@ -68,8 +68,6 @@ static const struct {
               FIELD(match),
               FIELD(before),
               FIELD(match_square),
-              FIELD(rival),
-              FIELD(rival_of),
               FIELD(compatible),
               FIELD(log_ways),
               FIELD(sums),

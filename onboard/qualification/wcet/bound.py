@@ -31,10 +31,9 @@ MOST_SHAPED = 80  # triangles that are looked up in frames of another shape, of 
 MOST_LEADERS = 192
 GROUP = 64  # stars whose votes are counted together
 FEW_VOTERS = (1, 2, 3, 4, 8, 16, C)
-MOST_NEARER_FITS = 3  # more fits per try, if four matched, with smaller reaches
-MOST_MODELS = 5  # and with shapes
+MOST_MODELS = 5  # more fits per try, if four matched, with shapes
 SHAPES = ("model", "shape", "faces", "determine")
-VERIFY = ("band", "star", "try", "iteration", "rival", "bound", *SHAPES)
+VERIFY = ("band", "star", "try", "iteration", "bound", *SHAPES)
 VOTES = ("group",)
 IDENTIFY = (*VERIFY, "take", "part", "block_of_rows", "sides", "pair", "third", "mark", *VOTES)
 TRACK = (*VERIFY, "predict", "next", "two")
@@ -349,7 +348,7 @@ def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
         found("shape", total(costs, "shape", n=n), 64 + 16 * n)
         found("faces", total(costs, "faces", n=n), 3072)
         found("determine", total(costs, "determine", n=n), 512 + 64 * n)
-    tries, more, models = [], [], []
+    tries, models = [], []
     for v in fits():
         n, near, within, matched = v["n"], v["near"], v["within"], v["matched"]
         steps = near + n * (within + 1) + 16 * matched
@@ -357,11 +356,7 @@ def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
         found("iteration", cost, steps)
         steps += 1 + near
         cost += total(costs, "fit", **v) + one["band"] + near * one["star"]
-        more.append((cost, steps))
         models.append((cost + total(costs, "model", n=n), steps + 64 + 16 * n))
-        for before in (4, n - 1):
-            rival = total(costs, "rival", before=before, **v)
-            found("rival", cost + rival, steps + 16 * before)
         cost, steps = cost + total(costs, "try", **v), steps + 32
         if matched >= 4:
             paid = 16 * (n + within)
@@ -374,9 +369,7 @@ def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
     low, high = 0.0, 1e6
     while high - low > 0.5:  # the least that pays for every try with its other fits
         each = 0.5 * (low + high)
-        nearer = max(0.0, *(cost - each * steps for cost, steps in more))
-        other = MOST_NEARER_FITS * nearer
-        other += MOST_MODELS * max(0.0, *(cost - each * steps for cost, steps in models))
+        other = MOST_MODELS * max(0.0, *(cost - each * steps for cost, steps in models))
         is_paid = all(cost + n * other <= each * steps for cost, steps, n in tries)
         low, high = (low, each) if is_paid else (each, high)
     worst["try"] = high
