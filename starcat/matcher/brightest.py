@@ -33,13 +33,7 @@ class Brightest:
     @property
     def frame(self) -> Frame:
         """The centroids that are searched, as a frame."""
-        mag, sigma = self.whole.mag, self.whole.sigma_px
-        return replace(
-            self.whole,
-            centroids_px=self.whole.centroids_px[self.rows],
-            mag=None if mag is None else mag[self.rows],
-            sigma_px=None if sigma is None else sigma[self.rows],
-        )
+        return self.whole.at(self.rows)
 
     def answer_of(self, searched: MatchResult) -> MatchResult:
         """Return the answer to the whole frame from the answer to its searched part.

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arguments import FLOAT64
-from starcat.arrays import Array, Pixels
+from starcat.arrays import Array
 from starcat.database.onboard.layout import FEATURES, METHODS
 from starcat.errors import ProductError
 from starcat.geometry.camera import Camera
@@ -252,23 +252,17 @@ class Search:
         self._one, self._null = _onboard.lib.starcat_identify_one, _onboard.ffi.NULL
         self._most = int(_onboard.lib.STARCAT_MAX_CENTROIDS)
 
-    def identify(
-        self,
-        centroids_px: Pixels,
-        magnitudes: Array | None,
-        prior: Prior | None = None,
-        sigma_px: Array | None = None,
-    ) -> MatchResult | None:
+    def identify(self, frame: Frame, prior: Prior | None = None) -> MatchResult | None:
         """Identify the stars of a frame; None if the library does not take it.
 
         The overhead of a call is the copying of arrays to the library and back, as bytes.
         """
-        count = len(centroids_px)
+        count = len(frame.centroids_px)
         if count > self._most:
             return None
-        px = centroids_px.tobytes()
-        mags = None if magnitudes is None else magnitudes.tobytes()
-        sigma = None if sigma_px is None else sigma_px.tobytes()
+        px = frame.centroids_px.tobytes()
+        mags = None if frame.mag is None else frame.mag.tobytes()
+        sigma = None if frame.sigma_px is None else frame.sigma_px.tobytes()
         memory = _FREE.pop() if _FREE else _Memory()
         arguments = (
             self._address,
@@ -288,13 +282,13 @@ class Search:
         _FREE.append(memory)
         if code not in STATUSES:
             return None
-        frame = Frame(
+        kept = Frame(
             np.ndarray((count, 2), FLOAT64, px),
             None if mags is None else np.ndarray(count, FLOAT64, mags),
             self.camera,
             None if sigma is None else np.ndarray(count, FLOAT64, sigma),
         )
-        return self.answer(record, frame, prior)
+        return self.answer(record, kept, prior)
 
     def identify_many(self, frames: Frames, threads: int = 1) -> tuple[BatchResult, list[int]]:
         """Identify the stars of frames; return the answers, and the frames without an answer.

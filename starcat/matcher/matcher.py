@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from starcat.arguments import HasFolder, check_type, database_path, whole_number
-from starcat.arrays import Array, Pixels
 from starcat.database.onboard.layout import FEATURES
 from starcat.database.onboard.reading import is_image
 from starcat.errors import ConfigError
@@ -36,8 +35,8 @@ from starcat.matcher.observation import (
     Frame,
     FrameLike,
     as_arrays,
-    as_frame,
     as_frames,
+    copied,
     frame_of_table,
     remarks_of,
 )
@@ -251,23 +250,17 @@ class Matcher:
                 camera, fov_deg = Camera(*size_px, fov_x_deg=fov_deg), None
         fov_error = 0.0 if fov_error is None else fov_error
         px, mags, sigma = as_arrays(values, mag, sigma_px)
+        frame = Frame(px, mags, camera, sigma)
         near = expected if isinstance(expected, Prior) else None
-        if len(px) <= MAX_CENTROIDS:
-            answer = self._search(px, camera, mags, sigma, fov_error, near, fov_deg)
+        if len(frame) <= MAX_CENTROIDS:
+            answer = self._search(frame, fov_error, near, fov_deg)
         else:
-            part = brightest_of(as_frame(px, camera, mags, sigma))
-            few = part.frame
-            searched = few.centroids_px, camera, few.mag, few.sigma_px
-            answer = part.answer_of(self._search(*searched, fov_error, near, fov_deg))
+            part = brightest_of(copied(frame))
+            answer = part.answer_of(self._search(part.frame, fov_error, near, fov_deg))
         if answer.ok and fov_deg is None and not answer.n_not_searched:
             rows = rows_of_second_pattern(answer, px, self.settings.tolerance_px)
             if rows is not None:
-                mag_of_rows = None if mags is None else mags[rows]
-                sigma_of_rows = None if sigma is None else sigma[rows]
-                other = self._search(
-                    px[rows], camera, mag_of_rows, sigma_of_rows, fov_error, None, None
-                )
-                answer = with_second_attitude(answer, rows, other)
+                answer = with_second_attitude(answer, rows, self._search(frame.at(rows), fov_error))
         if isinstance(expected, BoresightPrior):
             answer = expected.checked(answer)
         elif explain and answer.status == "no_match" and near is None and fov_deg is None:
@@ -318,21 +311,18 @@ class Matcher:
 
     def _search(
         self,
-        px: Pixels,
-        camera: Camera,
-        mag: Array | None,
-        sigma_px: Array | None,
+        frame: Frame,
         fov_error: float,
-        near: Prior | None,
-        fov_deg: tuple[float, float] | None,
+        near: Prior | None = None,
+        fov_deg: tuple[float, float] | None = None,
     ) -> MatchResult:
         """Identify the stars of a frame of at most `MAX_CENTROIDS`, in C if possible."""
         error = 0.0 if fov_deg is not None else self._checked_fov_error(fov_error)
         # The C library has no range of fields, and not an error of the scale and a prior at once.
-        in_c = None if fov_deg is not None or (error and near) else self._in_c(camera, error)
-        if in_c is not None and (answer := in_c.identify(px, mag, near, sigma_px)) is not None:
+        in_c = None if fov_deg is not None or (error and near) else self._in_c(frame.camera, error)
+        if in_c is not None and (answer := in_c.identify(frame, near)) is not None:
             return answer
-        return self._in_numpy(as_frame(px, camera, mag, sigma_px), error, near, fov_deg)
+        return self._in_numpy(copied(frame), error, near, fov_deg)
 
     def _in_numpy(
         self,

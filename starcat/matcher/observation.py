@@ -61,6 +61,11 @@ class Frame:
     def __len__(self) -> int:
         return len(self.centroids_px)
 
+    def at(self, rows: Rows | slice) -> Frame:
+        """Return the frame with some of its centroids."""
+        mag, sigma = (None if each is None else each[rows] for each in (self.mag, self.sigma_px))
+        return Frame(self.centroids_px[rows], mag, self.camera, sigma)
+
 
 @dataclass(frozen=True, eq=False)
 class Frames(Sequence[Frame]):
@@ -87,9 +92,7 @@ class Frames(Sequence[Frame]):
             return [self[n] for n in range(*frame.indices(len(self)))]
         frame = range(len(self))[frame]
         rows = slice(self.starts[frame], self.starts[frame + 1])
-        mag = None if self.mag is None else self.mag[rows]
-        sigma_px = None if self.sigma_px is None else self.sigma_px[rows]
-        return Frame(self.centroids_px[rows], mag, self.camera, sigma_px)
+        return Frame(self.centroids_px, self.mag, self.camera, self.sigma_px).at(rows)
 
 
 def as_frame(
@@ -99,9 +102,14 @@ def as_frame(
     sigma_px: ArrayLike | None = None,
 ) -> Frame:
     """Return a copy of the arrays of a caller as a frame; raise errors as `as_arrays` does."""
-    px, *each = as_arrays(centroids_px, mag, sigma_px)
-    mags, sigma = (None if values is None else values.copy() for values in each)
-    return Frame(px.copy(), mags, camera, sigma)
+    px, mags, sigma = as_arrays(centroids_px, mag, sigma_px)
+    return copied(Frame(px, mags, camera, sigma))
+
+
+def copied(frame: Frame) -> Frame:
+    """Return a frame of other arrays with the same numbers."""
+    mag, sigma = (None if each is None else each.copy() for each in (frame.mag, frame.sigma_px))
+    return Frame(frame.centroids_px.copy(), mag, frame.camera, sigma)
 
 
 def as_arrays(
