@@ -304,8 +304,6 @@ def _checked(
     their ranges; or if fewer centroids match than the caller asks for. If it ``is_plain``, most of
     the frame agrees with the stated camera as noise does, and the boresight is the camera's.
     """
-    if not agreement.chance < 1.0:
-        return agreement
     if agreement.share < observation.settings.min_share:
         return replace(agreement, withheld="share_of_frame")
     stars = database.directions[agreement.star_index[agreement.matched]]
