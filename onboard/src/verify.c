@@ -251,7 +251,8 @@ static uint32_t fit_matches(starcat_call *call, real m[9], uint32_t doubled, uin
   }
   for (uint32_t n = 0; n < doubled + STARCAT_REFINEMENTS; n++) {
     const int is_final = n >= doubled;
-    const real reach_px = is_final ? call->reach_px : (real)(1u << (doubled - n)) * call->reach_px;
+    const uint32_t factor = is_final ? 1u : 1u << (doubled - n);
+    const real reach_px = (real)factor * call->reach_px;
     starcat_project_stars(call, m, reach_px + call->margin_px);
     if (!starcat_spend_steps(call,
                              call->own->n_near + call->own->count * (call->own->n_within + 1u))) {
@@ -642,7 +643,7 @@ int starcat_try_shape(starcat_call *call, real m[9], const uint32_t triple[3], c
 /* Try an attitude with a multiple of the given focal length. Returns whether the search ends: the
  * answer is certain, or the steps are used up. */
 int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
-  const uint32_t doubled = call->fov_error > R(0.0) ? DOUBLED_FOR_SCALE : 0u;
+  uint32_t doubled = 0;
   real attitude[9];
   for (uint32_t k = 0; k < 9u; k++) {
     attitude[k] = m[k];
@@ -650,6 +651,9 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
   call->own->n_tried++;
   if (!starcat_spend_steps(call, STEPS_OF_TRY)) {
     return 1;
+  }
+  if (call->fov_error > R(0.0)) {
+    doubled = DOUBLED_FOR_SCALE;
   }
   (void)starcat_set_focal(call, focal);
   judge_fit(call, attitude, fit_matches(call, attitude, doubled, 0, NULL), 0, NULL,
