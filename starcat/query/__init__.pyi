@@ -10,6 +10,7 @@ from starcat.query.locked_duckdb import Columns as Columns
 from starcat.query.locked_duckdb import LockedDuckdb as LockedDuckdb
 from starcat.query.locked_duckdb import Rows as Rows
 from starcat.query.locked_duckdb import Values as Values
+from starcat.query.locked_duckdb import Views as Views
 from starcat.query.locked_duckdb import plain_value as plain_value
 from starcat.query.names import identifier as identifier
 from starcat.query.names import quoted_name as quoted_name

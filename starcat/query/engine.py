@@ -10,15 +10,15 @@ import math
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from starcat.errors import QueryLimitError
 from starcat.progress import Progress, no_progress
-from starcat.query.locked_duckdb import Columns, LockedDuckdb, Rows, Values
+from starcat.query.locked_duckdb import Columns, LockedDuckdb, Rows, Values, Views
 from starcat.query.statement import Statement
 
 if TYPE_CHECKING:
@@ -72,14 +72,7 @@ class Engine(Protocol):
     def look_at(self, files: Sequence[str]) -> None:
         """Read the columns of the Parquet files of a table, as a view would."""
 
-    def open(
-        self,
-        sql: str,
-        files: Sequence[str],
-        macros: Sequence[str],
-        numbers: Mapping[str, Sequence[str]],
-        sql_by_word: Mapping[str, str],
-    ) -> None:
+    def open(self, views: Views) -> None:
         """Make views and macros; from here on allow no other file and no other setting."""
 
     def statements(self, text: str) -> list[str]:
@@ -110,7 +103,7 @@ class LocalEngine:
 
     def __init__(self, scratch: Path, memory_gb: float, disk_gb: float) -> None:
         self._spill, self._memory_gb, self._disk_gb = scratch / "spill", memory_gb, disk_gb
-        self._opened: tuple[Any, ...] | None = None
+        self._views: Views | None = None
         self._asking = threading.RLock()
         self._duckdb: LockedDuckdb | None = None
 
@@ -127,18 +120,10 @@ class LocalEngine:
         """Read the columns of the Parquet files of a table, as a view would."""
         self._answer(lambda duckdb: duckdb.look_at(files))
 
-    def open(
-        self,
-        sql: str,
-        files: Sequence[str],
-        macros: Sequence[str],
-        numbers: Mapping[str, Sequence[str]],
-        sql_by_word: Mapping[str, str],
-    ) -> None:
+    def open(self, views: Views) -> None:
         """Make views and macros; from here on allow no other file and no other setting."""
-        opened = sql, files, macros, numbers, sql_by_word
-        self._answer(lambda duckdb: duckdb.open(*opened))
-        self._opened = opened
+        self._answer(lambda duckdb: duckdb.open(views))
+        self._views = views
 
     def statements(self, text: str) -> list[str]:
         """Return the queries of a text."""
@@ -241,8 +226,8 @@ class LocalEngine:
             shutil.rmtree(self._spill, ignore_errors=True)
             self._spill.mkdir(exist_ok=True)
             self._duckdb = LockedDuckdb(self._spill, self._memory_gb, self._disk_gb)
-            if self._opened is not None:
-                self._duckdb.open(*self._opened)
+            if self._views is not None:
+                self._duckdb.open(self._views)
         return self._duckdb
 
     def _stop(self, is_over: threading.Event, duckdb: LockedDuckdb) -> None:

@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,6 +45,19 @@ Columns = list[tuple[str, str]]
 """Names and DuckDB's types of columns."""
 
 Rows = list[tuple[Any, ...]]
+
+
+@dataclass(frozen=True)
+class Views:
+    """The views and macros of a DuckDB, and all that it may read."""
+
+    sql: str  # makes them
+    files: Sequence[str]  # the only files that are read from then on
+    macros: Sequence[str] = ()  # names of the macros used after FROM
+    # Arguments of macros that have to be numbers (`Macro.numbers`).
+    numbers: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    # Runs before the first query that contains the word (lower case).
+    sql_by_word: Mapping[str, str] = field(default_factory=dict)
 
 
 class LockedDuckdb:
@@ -92,31 +106,19 @@ class LockedDuckdb:
             "FROM read_parquet($files, hive_partitioning = false) LIMIT 0", {"files": list(files)}
         )
 
-    def open(
-        self,
-        sql: str,
-        files: Sequence[str],
-        macros: Sequence[str],
-        numbers: Mapping[str, Sequence[str]],
-        sql_by_word: Mapping[str, str],
-    ) -> None:
-        """Make views and macros by SQL; from here on allow no other file and no other setting.
-
-        ``macros`` are the macros used after FROM, ``numbers`` the arguments of macros that have to
-        be numbers (`Macro.numbers`). ``sql_by_word`` runs before the first query that contains
-        the word (lower case).
-        """
+    def open(self, views: Views) -> None:
+        """Make views and macros; from here on allow no other file and no other setting."""
         # A footer is read once, when a query first reaches its file.
         self._connection.execute("SET parquet_metadata_cache = true")
-        self._connection.execute(sql)
-        self._macros, self._numbers = frozenset(macros), numbers
-        self._sql_by_word = dict(sql_by_word)
+        self._connection.execute(views.sql)
+        self._macros, self._numbers = frozenset(views.macros), views.numbers
+        self._sql_by_word = dict(views.sql_by_word)
         # DuckDB keeps the progress, and the caller prints it. Times have the zone UTC everywhere.
         self._connection.execute(
             "SET enable_progress_bar = true; SET enable_progress_bar_print = false; "
             "SET TimeZone = 'UTC'"
         )
-        self._connection.execute("SET allowed_paths = $files", {"files": list(files)})
+        self._connection.execute("SET allowed_paths = $files", {"files": list(views.files)})
         self._connection.execute("SET enable_external_access = false")
         self._connection.execute("SET lock_configuration = true")
 

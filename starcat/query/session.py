@@ -22,6 +22,7 @@ from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Allowance, Engine, LocalEngine
 from starcat.query.gallery import macros
+from starcat.query.locked_duckdb import Views
 from starcat.query.names import short_names, sql_quoted
 from starcat.query.result import RunningQuery, facts_by_name, result_column
 from starcat.query.spatial_macros import (
@@ -298,7 +299,7 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
         "information_schema": comments,
     }
     try:
-        engine.open(_views_and_macros(targets), files, names, numbers, rare)
+        engine.open(Views(_views_and_macros(targets), files, names, numbers, rare))
     except QueryError as error:
         guilty = None if engine.is_running else _which_fails(engine, views)
         where = str(guilty.paths[0]) if guilty else ", ".join(target.name for target in targets)

@@ -24,6 +24,7 @@ from query_conformance import TIGHT, KeepsWithinItsLimits, beside_secrets, rows_
 from starcat.errors import QueryError, QueryLimitError, SchemaVersionError
 from starcat.query import engine as engine_module
 from starcat.query.engine import Allowance, LocalEngine
+from starcat.query.locked_duckdb import Views
 from starcat.query.session import Limits, Session, open_session, preamble_of
 from starcat.query.statement import REFUSED_FUNCTIONS, check_statement
 
@@ -314,7 +315,7 @@ def test_duckdb_itself_refuses_what_was_not_checked(folder, tmp_path, name):
     text = LOCKED[name].replace("{near}", str(folder.parent))
     try:
         stars = str(folder / "stars.parquet")
-        engine.open(f"CREATE VIEW stars AS FROM '{stars}'", [stars], [], {}, {})
+        engine.open(Views(f"CREATE VIEW stars AS FROM '{stars}'", [stars]))
         with pytest.raises(QueryError, match=r"disabled|locked|[Pp]ermission|Extension"):
             engine.rows(text, None, 10, Allowance(20.0))
         [(count,)] = engine.rows("SELECT count(*) FROM stars", None, 1, Allowance(20.0))[1]

@@ -20,6 +20,7 @@ from programs import printed_by
 from query_conformance import EXCEEDED, TIGHT, KeepsWithinItsLimits, beside_secrets, rows_of
 
 from starcat.errors import QueryError, QueryLimitError
+from starcat.query.locked_duckdb import Views
 from starcat.query.session import Limits, Session, open_session
 from starcat.query.statement import EXPLAIN_FORMATS, TABLE_FUNCTIONS
 from starcat_service.sandbox.query_engine import ConfinedEngine
@@ -85,7 +86,7 @@ def test_a_copy_that_came_through_could_write_nothing(folder, tmp_path):
     engine = ConfinedEngine(scratch, 0.5, 0.1)
     try:
         victim.chmod(0o666)
-        engine.open("SELECT 1", [str(victim)], [], {}, {})
+        engine.open(Views("SELECT 1", [str(victim)]))
         for text in (
             f"COPY (SELECT 1) TO '{victim}' (FORMAT parquet, USE_TMP_FILE false)",
             f"COPY (SELECT 1) TO '{victim}'",

@@ -14,16 +14,16 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcat.errors import QueryError, QueryLimitError
 from starcat.progress import Progress, no_progress
-from starcat.query import Allowance, Columns, Rows, Statement, Values, sql_quoted
+from starcat.query import Allowance, Columns, Rows, Statement, Values, Views, sql_quoted
 from starcat_service.sandbox.messages import (
     ARROW,
     ENDINGS,
@@ -111,19 +111,13 @@ class ConfinedEngine:
         """Read the columns of the Parquet files of a table, as a view would."""
         self.ask("look_at", list(files))
 
-    def open(
-        self,
-        sql: str,
-        files: Sequence[str],
-        macros: Sequence[str],
-        numbers: Mapping[str, Sequence[str]],
-        sql_by_word: Mapping[str, str],
-    ) -> None:
+    def open(self, views: Views) -> None:
         """Make views and macros; from then on the process reads only ``files``."""
-        folder = _common_folder(files)
+        folder = _common_folder(views.files)
         # Files are named relative to it: DuckDB shows the text of a view, but not its folder.
+        sql = views.sql
         text = sql.replace(sql_quoted(folder + os.sep)[:-1], "'") if folder else sql
-        opened = folder, text, list(files), list(macros), dict(numbers), dict(sql_by_word)
+        opened = folder, asdict(replace(views, sql=text))
         self.ask("open", *opened)
         self._opened = opened
 

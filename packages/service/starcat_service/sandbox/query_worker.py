@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.query import Columns, LockedDuckdb, Rows
+from starcat.query import Columns, LockedDuckdb, Rows, Views
 from starcat_service.sandbox.channel import Channel
 from starcat_service.sandbox.confinement import forbid_writing, limit_memory, limit_time
 from starcat_service.sandbox.messages import ARROW, DONE, ERROR, PART, PROGRESS, error_content
@@ -76,10 +76,10 @@ class QueryWorker:
             self._is_running = False
             self._channel.send(kind, answer)
 
-    def open(self, folder: str, *opened: Any) -> None:
+    def open(self, folder: str, views: dict[str, Any]) -> None:
         """Make the views, which name their files from the folder on."""
         os.chdir(folder or os.sep)
-        self._duckdb.open(*opened)
+        self._duckdb.open(Views(**views))
 
     def check(self, text: str) -> dict[str, Any]:
         """Return the checked statement of a text, for `query_messages.read_statement`."""
