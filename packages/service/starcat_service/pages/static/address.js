@@ -17,7 +17,7 @@ export function keep(values) {
   const query = new URLSearchParams(location.search);
   for (const [name, value] of Object.entries(values)) {
     query.delete(name);
-    for (const one of [value].flat()) if (one !== "") query.append(name, one);
+    for (const text of [value].flat()) if (text !== "") query.append(name, text);
   }
   goTo(`${query}` && `?${query}`);
 }

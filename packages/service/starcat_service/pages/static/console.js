@@ -18,9 +18,9 @@ function remember(text) {
     const all = [...new Set([text, ...before])].filter(Boolean).slice(0, MOST_RECENT);
     if (text) localStorage.setItem("queries", JSON.stringify(all));
     recent.hidden = all.length === 0;
-    recent.querySelector("ul").replaceChildren(...all.map((one) => {
+    recent.querySelector("ul").replaceChildren(...all.map((recentQuery) => {
       const [item, link] = ["li", "a"].map((name) => document.createElement(name));
-      Object.assign(link, { href: `?${new URLSearchParams({ query: one })}`, textContent: one });
+      Object.assign(link, { href: `?${new URLSearchParams({ query: recentQuery })}`, textContent: recentQuery });
       item.append(link);
       return item;
     }));
@@ -49,15 +49,15 @@ form.addEventListener("submit", async (event) => {
   asking?.abort();
   const mine = new AbortController();
   asking = mine;
-  const wanted = new URLSearchParams(new FormData(form));
+  const parameters = new URLSearchParams(new FormData(form));
   answer.setAttribute("aria-busy", "true");
   try {
-    const found = await fetch(`${form.action}?${wanted}&part=answer`, { signal: mine.signal });
-    const text = await found.text();
-    if (found.headers.get("Content-Type")?.startsWith("text/html")) answer.innerHTML = text;
+    const response = await fetch(`${form.action}?${parameters}&part=answer`, { signal: mine.signal });
+    const text = await response.text();
+    if (response.headers.get("Content-Type")?.startsWith("text/html")) answer.innerHTML = text;
     else answer.textContent = JSON.parse(text).detail;
-    history.replaceState(null, "", `?${wanted}`);
-    if (found.ok) remember(query.value.trim());
+    history.replaceState(null, "", `?${parameters}`);
+    if (response.ok) remember(query.value.trim());
     startTables(answer);
     for (const root of answer.querySelectorAll(".skyview[data-sky]")) startSky(root);
     announce(document.getElementById("answer-count")?.textContent ?? "The query failed");

@@ -1,23 +1,23 @@
-// A place where files can be dropped, for a field of files.
+// An area where files can be dropped, for a field of files.
 
 import { announce } from "./starcat.js";
 
-export function droppable(place, field, then) {
+export function droppable(area, field, then) {
   const over = (event) => {
     if (![...event.dataTransfer.types].includes("Files")) return;
     event.preventDefault();
-    place.classList.add("over");
+    area.classList.add("over");
   };
   document.getElementById("drop-words").hidden = false;
-  place.addEventListener("dragenter", over);
-  place.addEventListener("dragover", over);
-  place.addEventListener("dragleave", () => place.classList.remove("over"));
-  place.addEventListener("drop", (event) => {
+  area.addEventListener("dragenter", over);
+  area.addEventListener("dragover", over);
+  area.addEventListener("dragleave", () => area.classList.remove("over"));
+  area.addEventListener("drop", (event) => {
     event.preventDefault();
-    place.classList.remove("over");
+    area.classList.remove("over");
     if (!event.dataTransfer.files.length) return;
     field.files = event.dataTransfer.files;
     then();
-    announce([...field.files].map((one) => one.name).join(", "));
+    announce([...field.files].map((file) => file.name).join(", "));
   });
 }

@@ -25,12 +25,12 @@ if (form) {
     if (!file.files.length) return;
     const size = await createImageBitmap(file.files[0]).catch(() => null); // FITS is not one
     const fields = [form.elements["camera.width_px"], form.elements["camera.height_px"]];
-    if (!size || fields.some((one) => one.value)) return;
-    const own = [size.width, size.height];
-    if (own.every((one, k) => one === Number(fields[k].placeholder))) return;
-    fields.forEach((one, k) => { one.value = own[k]; });
+    if (!size || fields.some((field) => field.value)) return;
+    const dimensions = [size.width, size.height];
+    if (dimensions.every((pixels, k) => pixels === Number(fields[k].placeholder))) return;
+    fields.forEach((field, k) => { field.value = dimensions[k]; });
     document.getElementById("other-camera").open = true;
-    announce(`The picture has ${own.join(" x ")} px: say which field its camera has`);
+    announce(`The picture has ${dimensions.join(" x ")} px: say which field its camera has`);
   };
   file.addEventListener("change", compareSize);
   compareSize(); // it may have been chosen before this script came
@@ -46,7 +46,7 @@ if (form) {
     const link = event.target.closest('a[download][href^="data:"]');
     if (!link || link.href.length < 1_000_000) return;
     const [kind, content] = link.href.slice(5).split(";base64,");
-    const bytes = Uint8Array.from(atob(content), (one) => one.codePointAt(0));
+    const bytes = Uint8Array.from(atob(content), (character) => character.codePointAt(0));
     link.href = URL.createObjectURL(new Blob([bytes], { type: kind }));
   });
 

@@ -36,13 +36,13 @@ function showStage({ stage, done, total }) {
   if (total) [bar.max, bar.value] = [total, done];
   else bar.removeAttribute("value");
   const now = performance.now();
-  const told = document.getElementById("stage");
+  const stageLine = document.getElementById("stage");
   const shown = BYTES.has(word) ? size : count;
   // A listener hears each stage, not each step of the bar.
-  told.setAttribute("aria-live", told.dataset.stage === stage ? "off" : "polite");
-  if (told.dataset.stage !== stage || now - stageAt > STAGE_MS) {
-    told.textContent = total ? `${stage}: ${shown(done)} of ${shown(total)}` : stage;
-    [told.dataset.stage, stageAt] = [stage, now];
+  stageLine.setAttribute("aria-live", stageLine.dataset.stage === stage ? "off" : "polite");
+  if (stageLine.dataset.stage !== stage || now - stageAt > STAGE_MS) {
+    stageLine.textContent = total ? `${stage}: ${shown(done)} of ${shown(total)}` : stage;
+    [stageLine.dataset.stage, stageAt] = [stage, now];
   }
 }
 
@@ -68,7 +68,7 @@ async function redraw() {
   const job = document.getElementById("job");
   const news = page.getElementById("job");
   document.title = page.title;
-  const told = document.getElementById("stage");
+  const stageLine = document.getElementById("stage");
   job.dataset.state = news.dataset.state;
   job.querySelector(".page-head").replaceWith(news.querySelector(".page-head"));
   job.querySelectorAll(":scope > .notice").forEach((notice) => notice.remove());
@@ -77,9 +77,9 @@ async function redraw() {
   const [bar, next] = [document.getElementById("bar"), news.querySelector("#bar")];
   if (bar && next) bar.replaceWith(next);
   else bar?.remove();
-  told.setAttribute("aria-live", "polite");
-  told.textContent = news.querySelector("#stage").textContent;
-  delete told.dataset.stage;
+  stageLine.setAttribute("aria-live", "polite");
+  stageLine.textContent = news.querySelector("#stage").textContent;
+  delete stageLine.dataset.stage;
 }
 
 function watch() {

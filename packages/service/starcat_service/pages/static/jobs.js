@@ -32,8 +32,8 @@ function show(list, html) {
   shown = news.innerHTML;
   const before = states(list);
   for (const [id, row] of states(news)) {
-    const known = before.get(id);
-    if (known && known.dataset.state !== row.dataset.state) {
+    const earlierRow = before.get(id);
+    if (earlierRow && earlierRow.dataset.state !== row.dataset.state) {
       announce(`${row.dataset.title}: ${row.dataset.state}`);
     }
   }

@@ -29,13 +29,13 @@ const ranges = startSliders(form);
 // What the server says
 
 function showErrors(errors) {
-  for (const told of form.querySelectorAll("[id$='-error']")) {
-    const key = told.id.slice(0, -"-error".length);
+  for (const errorLine of form.querySelectorAll("[id$='-error']")) {
+    const key = errorLine.id.slice(0, -"-error".length);
     const message = errors[key] ?? "";
-    if (told.textContent !== message) told.textContent = message;
+    if (errorLine.textContent !== message) errorLine.textContent = message;
     const control = document.getElementById(key);
     (control?.closest(".field") ?? control?.closest(".copybox"))?.classList.toggle("wrong", message !== "");
-    const details = told.closest("details");
+    const details = errorLine.closest("details");
     if (message && details) details.open = true;
     if (message) control?.setAttribute("aria-invalid", "true");
     else control?.removeAttribute("aria-invalid");
@@ -45,7 +45,7 @@ function showErrors(errors) {
 // Gives a list other choices, each a value and its text, where they have changed.
 function offer(id, choices) {
   const list = document.getElementById(id);
-  if ([...list.options].map((one) => one.value).join("\n") === choices.map(([value]) => value).join("\n")) return;
+  if ([...list.options].map((option) => option.value).join("\n") === choices.map(([value]) => value).join("\n")) return;
   list.replaceChildren(...choices.map(([value, words]) => new Option(words, value)));
 }
 
@@ -58,8 +58,8 @@ function showValues(state) {
     if (control && control !== document.activeElement && control.value !== value) control.value = value;
   }
   document.getElementById(`lens-${state.lens}`).checked = true;
-  for (const [name, wanted] of Object.entries(state.products)) {
-    document.getElementById(`products.${name}.enabled`).checked = wanted;
+  for (const [name, isEnabled] of Object.entries(state.products)) {
+    document.getElementById(`products.${name}.enabled`).checked = isEnabled;
   }
   ranges.forEach(follow);
 }
@@ -131,19 +131,19 @@ async function ended(job, signal) {
   }
 }
 
-// `wanted` is what a button does besides: suggest, pin, unpin or photos.
-async function ask(wanted = "preview") {
+// `action` is what a button does besides: suggest, pin, unpin or photos.
+async function ask(action = "preview") {
   asked?.abort();
   clearTimeout(waiting);
   asked = new AbortController();
   result.setAttribute("aria-busy", "true");
   const fields = new FormData(form);
-  fields.set("do", wanted);
+  fields.set("do", action);
   const hasFile = response.files.length > 0;
-  if (wanted !== "photos") fields.delete("photos");
-  const sent = hasFile || wanted === "photos" ? fields : textsOf(fields);
+  if (action !== "photos") fields.delete("photos");
+  const sent = hasFile || action === "photos" ? fields : textsOf(fields);
   const { signal } = asked;
-  if (wanted === "preview") freshAddress(signal).catch(() => {});  // the estimate tells it, too
+  if (action === "preview") freshAddress(signal).catch(() => {});  // the estimate tells it, too
   try {
     const answer = await fetch(form.dataset.preview, {
       method: "POST", body: sent, signal,
@@ -157,11 +157,11 @@ async function ask(wanted = "preview") {
     show(state);
     if (state.job) {
       await ended(state.job, signal);
-      if (!signal.aborted) ask(wanted);
+      if (!signal.aborted) ask(action);
       return;
     }
     if (state.is_busy) {
-      waiting = setTimeout(ask, BUSY_AFTER_MS, wanted);
+      waiting = setTimeout(ask, BUSY_AFTER_MS, action);
       return;
     }
   } catch (error) {
@@ -182,11 +182,11 @@ text.addEventListener("blur", () => { if (text.value !== before.value && text.va
 // What a browser kept of a page that was left is newer than what the server sent.
 document.getElementById("update").hidden = true;
 form.addEventListener("submit", (event) => {
-  const wanted = event.submitter?.value;
-  if (["preview", "suggest", "pin", "unpin", "photos"].includes(wanted)) {
+  const action = event.submitter?.value;
+  if (["preview", "suggest", "pin", "unpin", "photos"].includes(action)) {
     event.preventDefault();
     form.dataset.state = "changed";
-    ask(wanted);
+    ask(action);
     return;
   }
   announce("Sent");

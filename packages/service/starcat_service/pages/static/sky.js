@@ -17,7 +17,7 @@ function skyAt(x, y) {
   return Math.abs(east) > 180 ? null : { ra: (360 - east) % 360, dec };
 }
 
-function placeOf(ra, dec) {
+function mapPosition(ra, dec) {
   const target = Math.PI * Math.sin(dec * DEG);
   let low = -Math.PI / 2;
   let high = Math.PI / 2;
@@ -40,8 +40,8 @@ export function startMap(figure, fieldsOf) {
 
   const load = async () => {
     if (fields) return;
-    const found = await fieldsOf();
-    fields = { ...found, u: found.ra_deg.map((ra, k) => direction(ra, found.dec_deg[k])) };
+    const columns = await fieldsOf();
+    fields = { ...columns, u: columns.ra_deg.map((ra, k) => direction(ra, columns.dec_deg[k])) };
   };
 
   const nearest = (sky) => {
@@ -66,7 +66,7 @@ export function startMap(figure, fieldsOf) {
     const ra = fields.ra_deg[number];
     const dec = fields.dec_deg[number];
     const stars = fields.stars[number];
-    cross.setAttribute("transform", `translate(${placeOf(ra, dec).join(" ")})`);
+    cross.setAttribute("transform", `translate(${mapPosition(ra, dec).join(" ")})`);
     cross.setAttribute("visibility", "visible");
     const sign = dec < 0 ? "\u2212" : "+";
     readout.textContent =

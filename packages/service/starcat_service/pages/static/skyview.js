@@ -3,7 +3,7 @@
 // Hammer's projection, turned so that the middle of the view is its middle: near it shapes are
 // true, and with the smallest zoom all of the sky is seen. Right ascension grows to the left.
 
-import { Fields, axes, cross, direction, dot, hammer, place, sum, unhammer } from "./sphere.js";
+import { Fields, axes, cross, direction, dot, hammer, position, sum, unhammer } from "./sphere.js";
 
 const DEG = Math.PI / 180;
 const WHOLE_DEG = 360; // across the width
@@ -31,16 +31,16 @@ class Sky {
     this.canvas = root.querySelector("canvas");
     this.pen = this.canvas.getContext("2d");
     this.readout = root.querySelector(".readout");
-    this.chosen = root.querySelector(".chosen");
+    this.details = root.querySelector(".chosen");
     this.data = JSON.parse(root.dataset.sky);
     this.fields = null;
     this.stars = [];
-    this.marks = (this.data.marks ?? []).map((one) => ({ ...one, kind: "mark", u: direction(one.ra_deg, one.dec_deg) }));
+    this.marks = (this.data.marks ?? []).map((mark) => ({ ...mark, kind: "mark", u: direction(mark.ra_deg, mark.dec_deg) }));
     this.at = { ra: 0, dec: 0, size: WHOLE_DEG, roll: 0, ...this.data.at };
     this.field = null;
     this.frame = this.data.frame ?? null;
     this.pointers = new Map();
-    this.layers = new Set([...root.querySelectorAll("[data-layer]")].filter((one) => one.checked).map((one) => one.dataset.layer));
+    this.layers = new Set([...root.querySelectorAll("[data-layer]")].filter((checkbox) => checkbox.checked).map((checkbox) => checkbox.dataset.layer));
     this.readAddress();
     this.listen();
     new ResizeObserver(() => this.fit()).observe(this.canvas);
@@ -57,7 +57,7 @@ class Sky {
       return;
     }
     this.root.dataset.state = "fields";
-    if (this.wanted !== undefined) this.choose(this.wanted);
+    if (this.addressField !== undefined) this.choose(this.addressField);
     this.moved();
   }
 
@@ -113,12 +113,12 @@ class Sky {
     this.moved();
   }
 
-  // Turn the sky so that a direction comes under a place of the screen.
+  // Turn the sky so that a direction comes under a position on the screen.
   drag(u, x, y) {
     for (let step = 0; step < 4; step += 1) {
       const now = this.skyAt(x, y);
       if (!now) return;
-      const [a, b] = [place(u), place(now)];
+      const [a, b] = [position(u), position(now)];
       const ra = this.at.ra + ((a.ra - b.ra + 540) % 360) - 180;
       this.at.ra = ((ra % 360) + 360) % 360;
       this.at.dec = Math.max(-89.999, Math.min(89.999, this.at.dec + a.dec - b.dec));
@@ -146,17 +146,17 @@ class Sky {
     this.writeAddress();
     if (!this.data.stars) return;
     const radius = this.radius();
-    const wanted = new URLSearchParams({
+    const parameters = new URLSearchParams({
       ra: this.at.ra.toFixed(4), dec: this.at.dec.toFixed(4), radius: radius.toFixed(4),
       faint: this.layers.has("faint") && radius < 30 ? "1" : "0",
     });
-    if (String(wanted) === this.known) return;
+    if (String(parameters) === this.loadedParameters) return;
     this.asking?.abort();
     this.asking = new AbortController();
     try {
-      const found = await this.ask(`${this.data.stars}?${wanted}`);
-      this.known = String(wanted);
-      this.stars = found.stars.map((one) => ({ ...one, u: direction(one.ra_deg, one.dec_deg) }));
+      const content = await this.ask(`${this.data.stars}?${parameters}`);
+      this.loadedParameters = String(parameters);
+      this.stars = content.stars.map((star) => ({ ...star, u: direction(star.ra_deg, star.dec_deg) }));
       this.root.dataset.state = "stars";
       this.root.dataset.count = this.stars.length;
       this.draw(); // at once: a star is found where it was drawn
@@ -173,34 +173,34 @@ class Sky {
   }
 
   readAddress() {
-    const given = new URLSearchParams(location.search).get("at");
-    const [ra, dec, size, roll] = (given ?? "").split(",").map(Number);
-    if (given && [ra, dec].every(Number.isFinite)) Object.assign(this.at, { ra, dec });
+    const view = new URLSearchParams(location.search).get("at");
+    const [ra, dec, size, roll] = (view ?? "").split(",").map(Number);
+    if (view && [ra, dec].every(Number.isFinite)) Object.assign(this.at, { ra, dec });
     if (Number.isFinite(size) && size > 0) this.at.size = Math.min(size, WHOLE_DEG);
     if (Number.isFinite(roll)) this.setRoll(roll);
     const field = Number(new URLSearchParams(location.search).get("field") ?? NaN);
-    if (Number.isInteger(field) && field >= 0) this.wanted = field;
+    if (Number.isInteger(field) && field >= 0) this.addressField = field;
   }
 
   writeAddress() {
     if (!this.data.fields) return; // an answer has an address of its own
-    const told = new URL(location.href);
+    const url = new URL(location.href);
     const { ra, dec, size, roll } = this.at;
-    if (size >= WHOLE_DEG && this.field === null) told.searchParams.delete("at");
-    else told.searchParams.set("at", [ra.toFixed(3), dec.toFixed(3), Number(size.toPrecision(4)), roll].join(","));
-    if (this.field === null) told.searchParams.delete("field");
-    else told.searchParams.set("field", this.field);
-    if (told.href !== location.href) history[this.isStep ? "pushState" : "replaceState"](null, "", told);
+    if (size >= WHOLE_DEG && this.field === null) url.searchParams.delete("at");
+    else url.searchParams.set("at", [ra.toFixed(3), dec.toFixed(3), Number(size.toPrecision(4)), roll].join(","));
+    if (this.field === null) url.searchParams.delete("field");
+    else url.searchParams.set("field", this.field);
+    if (url.href !== location.href) history[this.isStep ? "pushState" : "replaceState"](null, "", url);
     this.isStep = false;
   }
 
   // The browser's Back and Forward lead through the fields that were stepped to.
   comeBack() {
     Object.assign(this.at, { ra: 0, dec: 0, size: WHOLE_DEG, roll: 0, ...this.data.at });
-    [this.field, this.wanted] = [null, undefined];
+    [this.field, this.addressField] = [null, undefined];
     this.readAddress();
-    this.chosen.hidden = this.wanted === undefined;
-    if (this.wanted !== undefined && this.fields) this.choose(this.wanted);
+    this.details.hidden = this.addressField === undefined;
+    if (this.addressField !== undefined && this.fields) this.choose(this.addressField);
     this.rank = this.fields?.emptiest.indexOf(this.field) ?? -1;
     this.moved();
   }
@@ -273,13 +273,13 @@ class Sky {
   drawGrid() {
     const { pen } = this;
     const shown = this.at.size >= 180 ? 180 : this.at.size;
-    const step = STEPS_DEG.find((one) => one >= shown / 7) ?? 30;
+    const step = STEPS_DEG.find((spacing) => spacing >= shown / 7) ?? 30;
     const reach = this.radius();
     const low = Math.max(-90, this.at.dec - reach);
     const high = Math.min(90, this.at.dec + reach);
     const isPole = low <= -89.9 || high >= 89.9;
     const wide = isPole ? 180 : Math.min(180, reach / Math.cos(Math.max(-low, high) * DEG));
-    const raStep = [step, 2 * step, 5, 10, 15, 30].find((one) => one >= step && wide / one < 12) ?? 30;
+    const raStep = [step, 2 * step, 5, 10, 15, 30].find((spacing) => spacing >= step && wide / spacing < 12) ?? 30;
     pen.strokeStyle = COLOURS.grid;
     pen.fillStyle = COLOURS.text;
     pen.font = "11px system-ui, sans-serif";
@@ -299,62 +299,62 @@ class Sky {
       const ra = k * raStep;
       this.line(even(low, high).map((dec) => direction(ra, dec)));
       const [x, y] = this.onScreen(direction(ra, this.at.dec));
-      const told = `${((ra % 360) + 360) % 360 === 0 ? 0 : (((ra % 360) + 360) % 360).toFixed(raStep < 1 ? 2 : 0)}\u00b0`;
-      pen.fillText(told, x + 3, shown < 180 ? this.height - 5 : y - 3);
+      const label = `${((ra % 360) + 360) % 360 === 0 ? 0 : (((ra % 360) + 360) % 360).toFixed(raStep < 1 ? 2 : 0)}\u00b0`;
+      pen.fillText(label, x + 3, shown < 180 ? this.height - 5 : y - 3);
     }
     const side = cross([0, 0, 1], POLE);
     const length = Math.hypot(...side);
-    const first = side.map((one) => one / length);
+    const first = side.map((component) => component / length);
     const second = cross(POLE, first);
     pen.strokeStyle = COLOURS.plane;
     pen.lineWidth = 1.8;
     pen.setLineDash([7, 5]);
-    this.line(even(0, 360).flatMap((one) => [one, one + 3]).map((one) => sum([Math.cos(one * DEG), first], [Math.sin(one * DEG), second])));
+    this.line(even(0, 360).flatMap((angleDeg) => [angleDeg, angleDeg + 3]).map((angleDeg) => sum([Math.cos(angleDeg * DEG), first], [Math.sin(angleDeg * DEG), second])));
     pen.setLineDash([]);
   }
 
   get drawn() {
-    return this.stars.filter((one) => this.layers.has(one.kind)).concat(this.marks);
+    return this.stars.filter((star) => this.layers.has(star.kind)).concat(this.marks);
   }
 
   drawStars() {
     const { pen } = this;
-    const magnitudes = this.stars.filter((one) => one.kind === "guide" && one.mag !== null).map((one) => one.mag);
+    const magnitudes = this.stars.filter((star) => star.kind === "guide" && star.mag !== null).map((star) => star.mag);
     const faintest = magnitudes.length ? Math.max(...magnitudes) : 6;
     const named = [];
-    for (const one of this.drawn) {
-      const [x, y] = this.onScreen(one.u);
-      one.x = x;
-      one.y = y;
-      one.isSeen = x > -20 && y > -20 && x < this.width + 20 && y < this.height + 20 && dot(one.u, this.axes.c) > -0.999;
-      if (!one.isSeen) continue;
-      const r = Math.max(1.1, Math.min(8, 1.3 + 0.75 * (faintest - (one.mag ?? faintest))));
-      this.drawStar(one, x, y, this.at.size >= 180 ? 0.6 * r : r);
-      if (one.kind !== "faint" && (one.name || (one.kind === "mark" && one.label))) named.push(one);
+    for (const star of this.drawn) {
+      const [x, y] = this.onScreen(star.u);
+      star.x = x;
+      star.y = y;
+      star.isSeen = x > -20 && y > -20 && x < this.width + 20 && y < this.height + 20 && dot(star.u, this.axes.c) > -0.999;
+      if (!star.isSeen) continue;
+      const r = Math.max(1.1, Math.min(8, 1.3 + 0.75 * (faintest - (star.mag ?? faintest))));
+      this.drawStar(star, x, y, this.at.size >= 180 ? 0.6 * r : r);
+      if (star.kind !== "faint" && (star.name || (star.kind === "mark" && star.label))) named.push(star);
     }
     named.sort((a, b) => (a.mag ?? 99) - (b.mag ?? 99));
     pen.fillStyle = COLOURS.guide;
     pen.strokeStyle = "rgb(0 0 0 / 70%)";
     pen.lineWidth = 3;
     pen.lineJoin = "round";
-    for (const one of named.slice(0, NAMED + Math.min(this.marks.length, MOST_LABELS))) {
-      const [text, y] = [one.name || one.label, one.y + 4];
+    for (const star of named.slice(0, NAMED + Math.min(this.marks.length, MOST_LABELS))) {
+      const [text, y] = [star.name || star.label, star.y + 4];
       const wide = pen.measureText(text).width;
-      const right = one.x + 9 + wide;
+      const right = star.x + 9 + wide;
       const fits = right < this.width && this.skyAt(right, y + 4) && this.skyAt(right, y - 12);
-      const x = fits ? one.x + 9 : one.x - 9 - wide;
+      const x = fits ? star.x + 9 : star.x - 9 - wide;
       pen.strokeText(text, x, y);
       pen.fillText(text, x, y);
     }
     if (this.star?.isSeen) this.ring(this.star.x, this.star.y, 12, COLOURS.mark);
   }
 
-  drawStar(one, x, y, r) {
+  drawStar(star, x, y, r) {
     const { pen } = this;
-    pen.fillStyle = COLOURS[one.kind];
-    if (one.kind === "mark") {
-      this.ring(x, y, 9, one.colour === "rejected" ? COLOURS.rejected : COLOURS.mark);
-    } else if (one.kind === "rejected") {
+    pen.fillStyle = COLOURS[star.kind];
+    if (star.kind === "mark") {
+      this.ring(x, y, 9, star.colour === "rejected" ? COLOURS.rejected : COLOURS.mark);
+    } else if (star.kind === "rejected") {
       const isWhole = this.at.size >= 180; // there are many: they must not hide the fields
       pen.strokeStyle = COLOURS.rejected;
       pen.globalAlpha = isWhole ? 0.5 : 1;
@@ -369,7 +369,7 @@ class Sky {
       pen.globalAlpha = 1;
     } else {
       pen.beginPath();
-      pen.arc(x, y, one.kind === "faint" ? 0.9 : r, 0, 2 * Math.PI);
+      pen.arc(x, y, star.kind === "faint" ? 0.9 : r, 0, 2 * Math.PI);
       pen.fill();
     }
   }
@@ -411,18 +411,18 @@ class Sky {
   under(x, y) {
     let best = null;
     let least = REACH_PX;
-    for (const one of this.drawn) {
-      const off = one.isSeen ? Math.hypot(one.x - x, one.y - y) : Infinity;
-      if (off < least) [least, best] = [off, one];
+    for (const star of this.drawn) {
+      const off = star.isSeen ? Math.hypot(star.x - x, star.y - y) : Infinity;
+      if (off < least) [least, best] = [off, star];
     }
     return best;
   }
 
-  starInWords(one) {
-    const name = one.name ? `${one.name} (${one.label})` : one.label;
-    const what = { guide: "a guide star", rejected: `rejected: ${one.reason}`, faint: `rejected: ${one.reason}`, mark: one.reason ?? "in the answer" }[one.kind];
-    const mag = one.mag === null || one.mag === undefined ? "" : `, ${one.mag.toFixed(2)} mag`;
-    return `${name}${mag}, ${what}; RA ${angle(one.ra_deg, 4)}, Dec ${angle(one.dec_deg, 4)}`;
+  starInWords(star) {
+    const name = star.name ? `${star.name} (${star.label})` : star.label;
+    const what = { guide: "a guide star", rejected: `rejected: ${star.reason}`, faint: `rejected: ${star.reason}`, mark: star.reason ?? "in the answer" }[star.kind];
+    const mag = star.mag === null || star.mag === undefined ? "" : `, ${star.mag.toFixed(2)} mag`;
+    return `${name}${mag}, ${what}; RA ${angle(star.ra_deg, 4)}, Dec ${angle(star.dec_deg, 4)}`;
   }
 
   fieldInWords(number) {
@@ -436,7 +436,7 @@ class Sky {
     if (star) this.tell(this.starInWords(star));
     else if (!u) this.tell("");
     else if (this.fields) this.tell(this.fieldInWords(this.fields.nearest(u)));
-    else this.tell(`RA ${angle(place(u).ra, 3)}, Dec ${angle(place(u).dec, 3)}`);
+    else this.tell(`RA ${angle(position(u).ra, 3)}, Dec ${angle(position(u).dec, 3)}`);
   }
 
   click(x, y) {
@@ -448,8 +448,8 @@ class Sky {
 
   chooseStar(star) {
     this.star = star;
-    this.chosen.hidden = false;
-    this.chosen.querySelector(".what").textContent = this.starInWords(star);
+    this.details.hidden = false;
+    this.details.querySelector(".what").textContent = this.starInWords(star);
     this.link(...this.linksOf(star));
     this.paint();
   }
@@ -462,13 +462,13 @@ class Sky {
     const table = star.kind === "guide" || star.kind === "mark" ? "stars" : "rejected";
     if (star.id) to("Its row", sql, { query: `SELECT * FROM ${table}\nWHERE star_id = ${star.id}` });
     if (simbad && star.id) to("SIMBAD", simbad, { Ident: star.label });
-    const place = `${star.ra_deg.toFixed(6)} ${star.dec_deg < 0 ? "" : "+"}${star.dec_deg.toFixed(6)}`;
-    if (catalog && star.id) to(`VizieR ${catalog}`, vizier, { "-source": catalog, "-c": place, "-c.rs": "5" });
+    const coordinates = `${star.ra_deg.toFixed(6)} ${star.dec_deg < 0 ? "" : "+"}${star.dec_deg.toFixed(6)}`;
+    if (catalog && star.id) to(`VizieR ${catalog}`, vizier, { "-source": catalog, "-c": coordinates, "-c.rs": "5" });
     return links;
   }
 
   link(...links) {
-    this.chosen.querySelector(".links").replaceChildren(...links.map(([text, address]) => {
+    this.details.querySelector(".links").replaceChildren(...links.map(([text, address]) => {
       const link = document.createElement("a");
       Object.assign(link, { href: address, textContent: text });
       if (!address.startsWith("/")) link.rel = "noreferrer external";
@@ -480,10 +480,10 @@ class Sky {
     if (number >= this.fields.size) return;
     this.field = number;
     this.star = null;
-    this.chosen.hidden = false;
-    this.chosen.querySelector(".what").textContent = this.fieldInWords(number);
+    this.details.hidden = false;
+    this.details.querySelector(".what").textContent = this.fieldInWords(number);
     const [ra, dec] = [this.fields.ra[number].toFixed(6), this.fields.dec[number].toFixed(6)];
-    const [wide, high] = this.data.fov.map((one) => one.toFixed(6));
+    const [wide, high] = this.data.fov.map((fovDeg) => fovDeg.toFixed(6));
     const query = `SELECT designation, mag, ra_deg, dec_deg, field_x_deg, field_y_deg\nFROM field(${ra}, ${dec}, ${this.at.roll}, ${wide}, ${high})\nORDER BY mag`;
     this.link(["Its stars as rows", `${this.data.sql}?${new URLSearchParams({ query })}`]);
     this.root.dataset.field = number;
@@ -509,8 +509,8 @@ class Sky {
     this.at.roll = ((Math.round(roll * 10) / 10) % 360 + 360) % 360;
     const slider = this.root.querySelector("[data-roll]");
     if (slider) slider.value = this.at.roll;
-    const told = this.root.querySelector("[data-roll-told]");
-    if (told) told.textContent = `${this.at.roll}\u00b0`;
+    const rollReadout = this.root.querySelector("[data-roll-told]");
+    if (rollReadout) rollReadout.textContent = `${this.at.roll}\u00b0`;
   }
 
   listen() {
@@ -523,7 +523,7 @@ class Sky {
       canvas.setPointerCapture(event.pointerId);
       const [x, y] = at(event);
       this.pointers.set(event.pointerId, { x, y });
-      this.held = { u: this.skyAt(x, y), x, y, isClick: this.pointers.size === 1 };
+      this.press = { u: this.skyAt(x, y), x, y, isClick: this.pointers.size === 1 };
     });
     canvas.addEventListener("pointermove", (event) => {
       const [x, y] = at(event);
@@ -531,22 +531,22 @@ class Sky {
         this.say(x, y);
         return;
       }
-      const before = [...this.pointers.values()].map((one) => ({ ...one }));
+      const before = [...this.pointers.values()].map((pointer) => ({ ...pointer }));
       this.pointers.set(event.pointerId, { x, y });
       const now = [...this.pointers.values()];
       if (now.length === 2) {
         const apart = ([a, b]) => Math.hypot(a.x - b.x, a.y - b.y);
-        this.held.isClick = false;
+        this.press.isClick = false;
         this.zoom(apart(before) / Math.max(1, apart(now)), (now[0].x + now[1].x) / 2, (now[0].y + now[1].y) / 2);
         return;
       }
-      if (Math.hypot(x - this.held.x, y - this.held.y) > 4) this.held.isClick = false;
-      if (this.held.isClick || !this.held.u) return;
-      this.drag(this.held.u, x, y);
+      if (Math.hypot(x - this.press.x, y - this.press.y) > 4) this.press.isClick = false;
+      if (this.press.isClick || !this.press.u) return;
+      this.drag(this.press.u, x, y);
       this.moved();
     });
     const end = (event) => {
-      const isClick = this.held?.isClick && event.type === "pointerup";
+      const isClick = this.press?.isClick && event.type === "pointerup";
       this.pointers.delete(event.pointerId);
       if (isClick) this.click(...at(event));
     };

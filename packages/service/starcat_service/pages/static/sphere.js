@@ -10,7 +10,7 @@ export function direction(ra, dec) {
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 export const sum = (...parts) => [0, 1, 2].map((k) => parts.reduce((all, [f, u]) => all + f * u[k], 0));
-export const place = (u) => ({
+export const position = (u) => ({
   ra: (Math.atan2(u[1], u[0]) / DEG + 360) % 360,
   dec: Math.atan2(u[2], Math.hypot(u[0], u[1])) / DEG,
 });
@@ -59,8 +59,8 @@ export class Fields {
     this.sorted = this.byDec.map((k) => dec_deg[k]);
     this.reach = Math.max(3 / Math.sqrt(this.size) / DEG, 0.01);
     this.emptiest = this.ra.map((_, k) => k).sort((a, b) => count[a] - count[b] || a - b);
-    this.colour = count.map((one) => {
-      const bin = bins.findLast(({ least }) => least <= one) ?? bins[0];
+    this.colour = count.map((starCount) => {
+      const bin = bins.findLast(({ least }) => least <= starCount) ?? bins[0];
       const number = parseInt(bin.colour, 16);
       return [number >> 16, (number >> 8) & 255, number & 255];
     });

@@ -21,9 +21,9 @@ function setTheme(name) {
 
 function startTheme() {
   const button = document.getElementById("theme");
-  const told = document.getElementById("theme-name");
+  const label = document.getElementById("theme-name");
   const tell = () => {
-    told.textContent = THEMES[theme()];
+    label.textContent = THEMES[theme()];
     button.title = `Theme: ${THEMES[theme()]}`;
   };
   button.hidden = false;

@@ -11,12 +11,12 @@ const UNITS = { kB: 1e3, MB: 1e6, GB: 1e9, TB: 1e12 };
 function valueOf(row, column) {
   const text = row.cells[column]?.textContent.trim() ?? "";
   const plain = text.replaceAll("\u2212", "-").replace(/[\s,\u202f\u00a0](?=\d{3}(\D|$))/g, "");
-  const found = /^([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)\s*(kB|MB|GB|TB|B|[°%]|px|arcsec)?$/i.exec(plain);
-  return found ? Number(found[1]) * (UNITS[found[2]] ?? 1) : text;
+  const match = /^([-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?)\s*(kB|MB|GB|TB|B|[°%]|px|arcsec)?$/i.exec(plain);
+  return match ? Number(match[1]) * (UNITS[match[2]] ?? 1) : text;
 }
 
 function compare(a, b) {
-  const kinds = [a, b].map((one) => (typeof one === "number" ? 0 : one === "" || one === "–" ? 2 : 1));
+  const kinds = [a, b].map((value) => (typeof value === "number" ? 0 : value === "" || value === "–" ? 2 : 1));
   if (kinds[0] !== kinds[1]) return kinds[0] - kinds[1];
   return kinds[0] === 0 ? a - b : a.localeCompare(b, undefined, { numeric: true });
 }
@@ -42,12 +42,12 @@ function startTable(table) {
   });
 
   function sort() {
-    const told = kept(sortName);
-    const name = told.replace(/^-/, "");
+    const order = kept(sortName);
+    const name = order.replace(/^-/, "");
     for (const head of heads) head.removeAttribute("aria-sort");
     const number = heads.findIndex((head) => column(head) === name);
     if (number < 0) return;
-    const sign = told.startsWith("-") ? -1 : 1;
+    const sign = order.startsWith("-") ? -1 : 1;
     heads[number].setAttribute("aria-sort", sign > 0 ? "ascending" : "descending");
     const values = new Map(rows.map((row) => [row, valueOf(row, number)]));
     body.append(...[...rows].sort((a, b) => sign * compare(values.get(a), values.get(b))));
