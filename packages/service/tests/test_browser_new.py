@@ -260,7 +260,7 @@ def test_task_photographs_tell_their_camera(page, tmp_path_factory):
     page.get_by_label("Photographs of stars").set_input_files(photographs)
     click(page, page.get_by_role("button", name="Find the camera"))
     page.locator("#wrong", has_text="is being built, once for all users").wait_for()
-    page.locator("#wrong", has_text="2 of them identified").wait_for(timeout=3 * BUILD_MS)
+    page.locator("#wrong", has_text="2 files, 2 identified").wait_for(timeout=3 * BUILD_MS)
     settled(page)
     assert page.clicks + 1 <= 6
     field = page.get_by_label("Field across the width deg", exact=True)

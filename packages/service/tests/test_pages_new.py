@@ -314,13 +314,13 @@ def test_photographs_tell_their_camera(client, photographs):
     assert float(state["values"]["camera.fov_x_deg"]) == draft.spec.camera.fov_x_deg
     assert draft.spec.selection.faint_limit_mag >= 4.5
     assert 0.02 < draft.spec.self_test.noise_px < 0.6
-    assert "2 of them identified: a, 2-a" in state["wrong"]
+    assert "From 2 files, 2 identified: a, 2-a." in state["wrong"]
     for key in ("camera.fov_x_deg", "selection.faint_limit_mag", "self_test.noise_px"):
         assert f"# {key} = " in state["toml"]
     assert state["can_build"]
     form = {"toml": SPEC, "toml-before": SPEC, "do": "photos"}  # without scripts
     page = client.post("/new", data=form, files=[("photos", ("../a.png", photographs[0]))])
-    assert "1 of them identified: a." in page.text
+    assert "From 1 file, 1 identified: a." in page.text
 
 
 def with_photographs(client: TestClient, *files: tuple[str, bytes]) -> dict[str, Any]:

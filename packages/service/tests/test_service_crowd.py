@@ -212,9 +212,9 @@ def test_a_crowd_keeps_no_page_of_another_user_waiting(
         f"{memory_bytes(crowded) / 1e6:.0f} MB\n"
     )
     assert cameras == [
-        camera_text for camera_text in cameras if "2 of them identified" in camera_text
+        camera_text for camera_text in cameras if "2 files, 2 identified" in camera_text
     ], cameras
-    assert "2 of them identified" in with_camera(crowded, pictures)
+    assert "2 files, 2 identified" in with_camera(crowded, pictures)
     assert set(counts) <= {200, 503}
     assert max(crowd.page_s) < max(MAX_PAGE_S, 4.0 * max(quiet.page_s))
     assert memory_bytes(crowded) < MAX_SERVER_BYTES
