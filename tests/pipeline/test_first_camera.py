@@ -103,7 +103,7 @@ def test_pictures_become_a_database_that_identifies_the_next(
     assert 0.02 < given["self_test"]["noise_px"] < 0.6
     for key in ("camera.fov_x_deg", "selection.faint_limit_mag", "self_test.noise_px"):
         assert f"# {key} = " in text
-    assert "2 of them identified: photo0, photo1." in text
+    assert "2 identified: photo0, photo1." in text
     assert starcat(["build", spec, "-o", tmp_path]).code == 0
     [found] = json.loads(starcat(["identify", tmp_path / "mycam-1.0.0", third, "--json"]).out)
     assert found["status"] == "identified"
