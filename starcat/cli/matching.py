@@ -135,14 +135,13 @@ def identify_command(
     """
     from starcat.frames.images.batch import files_of, is_batch
     from starcat.frames.images.contact_sheet import check_sheet
-    from starcat.frames.images.image_file import expect_room_for_wcs
-    from starcat.frames.images.solve_files import answer_file, is_picture
+    from starcat.frames.images.image_file import check_wcs_name
+    from starcat.frames.images.solve_files import answer_file
     from starcat.storage.figures import check_kind
 
     check_kind(picture, "picture")
     check_sheet(contact_sheet)
-    if wcs is not None and not is_batch(files):
-        expect_room_for_wcs(wcs, Path(files[0]), is_picture=is_picture(Path(files[0])))
+    check_wcs_name(wcs)
     expect_room(picture=picture, contact_sheet=contact_sheet, wcs=wcs)
     if is_batch(files) or contact_sheet is not None:
         _check_batch(context, picture, wcs)
@@ -223,6 +222,8 @@ def _print_file_answers(
 ) -> Tally:
     from starcat.cli.matches import print_answers
 
+    if wcs is not None:
+        answers.expect_picture(wcs)
     database = answers.matcher.database
     tally = print_answers(answers, database, as_json=as_json, as_lines=as_lines)
     for note in answers.notes(tally.first):

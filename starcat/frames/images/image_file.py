@@ -395,18 +395,11 @@ def _check_size(image: NDArray[Any], other: NDArray[Any], what: str) -> None:
         )
 
 
-def expect_room_for_wcs(path: Path, source: Path, *, is_picture: bool) -> None:
-    """Check, before anything is done, that a WCS can be written."""
-    if path.suffix.lower() not in _WCS_SUFFIXES:
+def check_wcs_name(path: Path | None) -> None:
+    """Refuse a name that is not of a FITS file, before the work for it is done."""
+    if path is not None and path.suffix.lower() not in _WCS_SUFFIXES:
         raise ConfigError(
             "expected a FITS file, whose name ends with .fits", parameter="wcs", value=str(path)
-        )
-    if not is_picture:
-        raise ConfigError(
-            f"{source} holds centroids, and a WCS is written into a copy of a picture",
-            parameter="wcs",
-            value=str(path),
-            hint=("give the picture", "use MatchResult.wcs() in Python"),
         )
 
 

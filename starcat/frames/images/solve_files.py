@@ -352,6 +352,16 @@ class FileAnswers:
             camera = answer.result.camera or self.camera
             draw(path, answer.frame, image, answer.result, database, camera, answer.sky)
 
+    def expect_picture(self, wcs: Path) -> None:
+        """Raise `ConfigError` if the file has no picture into whose copy a WCS can be written."""
+        if not self.is_image:
+            raise ConfigError(
+                f"{self.path} holds centroids, and a WCS is written into a copy of a picture",
+                parameter="wcs",
+                value=str(wcs),
+                hint=("give the picture", "use MatchResult.wcs() in Python"),
+            )
+
     def write_wcs(self, path: Path, answer: FrameAnswer) -> None:
         """Write a FITS copy of the image with the world coordinates that were found."""
         from starcat.frames.images.image_file import write_wcs
