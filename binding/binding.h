@@ -25,7 +25,7 @@ typedef struct {
   double fold_radius;
 } starcat_camera;
 typedef struct {
-  double tolerance_px, noise_px, noise_mag, log_chance, fov_error;
+  double tolerance_px, noise_px, noise_mag, log_chance, fov_error, camera_error;
   uint32_t max_steps;
 } starcat_options;
 typedef struct {

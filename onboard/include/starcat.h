@@ -188,6 +188,9 @@ typedef struct {
   starcat_real fov_error;    /* largest relative error of the focal length, up to 0.5;
                                             if not 0, it is fitted with the attitude (method
                                             triangle only); 0: it is known */
+  starcat_real camera_error; /* largest error of a calibrated camera at the corners, as a share
+                                            of the half diagonal, up to 0.1: it narrows the
+                                            shapes that a frame can have; 0: not stated */
   uint32_t max_steps;        /* bound on the work; see starcat_result.steps */
 } starcat_options;
 

@@ -115,7 +115,7 @@ real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_mat
     return R(0.0);
   }
   for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
-    half[k] = starcat_half_range(call, k);
+    half[k] = call->half_range[k];
   }
   if (free > 0u) {
     growth = starcat_log_growth(call, terms);

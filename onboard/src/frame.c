@@ -6,6 +6,7 @@
 
 #define LOG_CERTAIN R(-20.723265836946411156) /* of 1e-9 */
 #define WIDEST_FOV_ERROR R(0.5)
+#define MOST_CAMERA_ERROR R(0.1)
 #define MOST_NOISE_MAG R(1e6)
 
 starcat_status starcat_set_default_options(starcat_options *options) {
@@ -17,17 +18,19 @@ starcat_status starcat_set_default_options(starcat_options *options) {
   options->noise_mag = R(0.0);
   options->log_chance = LOG_CERTAIN;
   options->fov_error = R(0.0);
+  options->camera_error = R(0.0);
   options->max_steps = 4000000u;
   return STARCAT_OK;
 }
 
 starcat_status starcat_check_options(const starcat_options *o) {
-  if (!starcat_are_finite((const real *)(const void *)o, 5)) {
+  if (!starcat_are_finite((const real *)(const void *)o, 6)) {
     return STARCAT_E_NOT_FINITE;
   }
   if (!starcat_is_between(o->noise_px, R(0.0), STARCAT_LARGEST_PX) ||
       !starcat_is_between(o->noise_mag, R(0.0), MOST_NOISE_MAG) ||
-      !starcat_is_between(o->fov_error, R(0.0), WIDEST_FOV_ERROR) || (o->max_steps == 0u) ||
+      !starcat_is_between(o->fov_error, R(0.0), WIDEST_FOV_ERROR) ||
+      !starcat_is_between(o->camera_error, R(0.0), MOST_CAMERA_ERROR) || (o->max_steps == 0u) ||
       !starcat_is_between(o->noise_px > R(0.0) ? o->noise_px : o->tolerance_px, STARCAT_LEAST_PX,
                           STARCAT_LARGEST_PX)) {
     return STARCAT_E_OPTIONS;
@@ -142,6 +145,7 @@ static void set_limits(starcat_call *call, const starcat_options *options) {
   call->focal = R(1.0);
   call->focal_px = call->camera.given.focal_length_px;
   starcat_allow_scales(call, options->fov_error);
+  starcat_set_ranges(call, options->camera_error);
   call->tolerance_rad = call->tolerance_px / call->camera.given.focal_length_px;
   call->reach_px = STARCAT_REACH * call->tolerance_px;
   call->mag_reach =

@@ -113,6 +113,7 @@ typedef struct {
   real focal, focal_px; /* focal length over the given one; the given one, pixels */
   real fov_error;       /* largest relative error of the focal length; 0: it is known */
   real log_scales, bend;
+  real half_range[STARCAT_SHAPE_TERMS]; /* largest terms of a shape, of both signs */
   real tolerance_px, tolerance_rad, reach_px;
   real noise_px;       /* standard deviation of a centroid on each axis; 0: not stated */
   real columns_per_px; /* columns of the detector that list its centroids */
@@ -243,7 +244,7 @@ real starcat_log_ball(uint32_t dimensions, real square);
 uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, real sigma_px);
 
 /* shape.c */
-real starcat_half_range(const starcat_call *call, uint32_t term);
+void starcat_set_ranges(starcat_call *call, real camera_error);
 int starcat_is_within_ranges(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 int starcat_set_focal(starcat_call *call, real focal);
 int starcat_use_shape(starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);

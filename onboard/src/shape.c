@@ -17,18 +17,12 @@
 #define HALF_RANGE R(0.10) /* largest term, of both signs, but the first: */
 #define HALF_RANGE_OF_SCALE R(0.05)
 
-/* The largest size of a term. The stated error of the focal length replaces that of the scale. */
-real starcat_half_range(const starcat_call *call, uint32_t term) {
-  const real of_scale = call->log_scales > R(0.0) ? R(0.5) * call->log_scales : HALF_RANGE_OF_SCALE;
-  return term == 0u ? of_scale : HALF_RANGE;
-}
-
 /* Whether the terms of an answer are within their ranges; the scale can be outside, with a remark. */
 int starcat_is_within_ranges(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]) {
   int is_within = 1;
   for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
     const real widest = k == 0u ? STARCAT_WIDER_RANGE : R(1.0);
-    is_within = is_within && (starcat_absolute(terms[k]) <= widest * starcat_half_range(call, k));
+    is_within = is_within && (starcat_absolute(terms[k]) <= widest * call->half_range[k]);
   }
   return is_within;
 }
@@ -54,6 +48,25 @@ static void find_basis(const starcat_call *call, real x_px, real y_px,
   }
   basis[1][2] = y;
   basis[0][3] = y;
+}
+
+/* Set the largest terms. A stated error of the camera, as a share of the half diagonal, narrows them to
+ * the terms that move no corner farther, the farthest from the axis most; a stated error of the focal
+ * length is that of the scale. */
+void starcat_set_ranges(starcat_call *call, real camera_error) {
+  const starcat_camera *c = &call->camera.given;
+  const real most_px = camera_error * STARCAT_SQRT(call->camera.corner_square);
+  real basis[2][STARCAT_SHAPE_TERMS];
+  find_basis(call, c->x0_px < call->camera.half_width ? c->width_px : R(0.0),
+             c->y0_px < call->camera.half_height ? c->height_px : R(0.0), basis);
+  for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
+    const real most = k == 0u ? HALF_RANGE_OF_SCALE : HALF_RANGE;
+    const real moved = STARCAT_SQRT(basis[0][k] * basis[0][k] + basis[1][k] * basis[1][k]);
+    call->half_range[k] = camera_error > R(0.0) ? starcat_smaller(most, most_px / moved) : most;
+  }
+  if (call->log_scales > R(0.0)) {
+    call->half_range[0] = R(0.5) * call->log_scales;
+  }
 }
 
 /* Undo a shape at a place. */
@@ -254,7 +267,7 @@ int starcat_solve_normal(const starcat_call *call, const starcat_normal *n,
   starcat_normal copy = *n;
   step->free = free;
   for (uint32_t k = 0; k < free; k++) {
-    const real ratio = sigma_px / starcat_half_range(call, k);
+    const real ratio = sigma_px / call->half_range[k];
     copy.gram[ANGLES + k][ANGLES + k] += ratio * ratio;
     copy.right[ANGLES + k] -= ratio * ratio * terms[k];
   }

@@ -96,9 +96,9 @@ static void change_camera(fuzz_bytes *bytes, starcat_camera *c) {
 }
 
 static void change_options(fuzz_bytes *bytes, starcat_options *o) {
-  starcat_real *const numbers[5] = {&o->tolerance_px, &o->noise_px, &o->noise_mag, &o->log_chance,
-                                    &o->fov_error};
-  for (uint32_t n = fuzz_number(bytes, 1) % 8u; n < 5u; n++) {
+  starcat_real *const numbers[6] = {&o->tolerance_px, &o->noise_px, &o->noise_mag, &o->log_chance,
+                                    &o->fov_error,    &o->camera_error};
+  for (uint32_t n = fuzz_number(bytes, 1) % 8u; n < 6u; n++) {
     change(bytes, numbers[n]);
   }
   o->max_steps = 65535u - fuzz_number(bytes, 2);

@@ -69,9 +69,9 @@ static starcat_status with_option(starcat_real *option, starcat_real value,
 
 static void check_options(const starcat_frame *frame, const starcat_real q[4]) {
   starcat_options *o = &unit_scratch.options;
-  starcat_real *const numbers[5] = {&o->tolerance_px, &o->noise_px, &o->noise_mag, &o->log_chance,
-                                    &o->fov_error};
-  for (uint32_t n = 0; n < 5u; n++) {
+  starcat_real *const numbers[6] = {&o->tolerance_px, &o->noise_px, &o->noise_mag, &o->log_chance,
+                                    &o->fov_error,    &o->camera_error};
+  for (uint32_t n = 0; n < 6u; n++) {
     CHECK_IS(with_option(numbers[n], NAN_REAL, frame, q), STARCAT_E_NOT_FINITE);
     CHECK_IS(with_option(numbers[n], (starcat_real)INFINITY, frame, q), STARCAT_E_NOT_FINITE);
   }
@@ -84,6 +84,8 @@ static void check_options(const starcat_frame *frame, const starcat_real q[4]) {
   CHECK_IS(with_option(&o->noise_mag, (starcat_real)-1.0, frame, q), STARCAT_E_OPTIONS);
   CHECK_IS(with_option(&o->fov_error, (starcat_real)-0.1, frame, q), STARCAT_E_OPTIONS);
   CHECK_IS(with_option(&o->fov_error, (starcat_real)0.51, frame, q), STARCAT_E_OPTIONS);
+  CHECK_IS(with_option(&o->camera_error, (starcat_real)-0.01, frame, q), STARCAT_E_OPTIONS);
+  CHECK_IS(with_option(&o->camera_error, (starcat_real)0.11, frame, q), STARCAT_E_OPTIONS);
   o->max_steps = 0;
   CHECK_IS(identify(&unit_scratch, frame), STARCAT_E_OPTIONS);
   CHECK_IS(track(&unit_scratch, frame, q, PRIOR_RAD), STARCAT_E_OPTIONS);

@@ -405,6 +405,33 @@ static uint32_t search_shaped(const unit_sky *sky, uint32_t most) {
   return call.own->n_tried;
 }
 
+/* A stated error of the camera narrows the ranges to terms that move no corner farther. */
+static void check_camera_error(void) {
+  static const double errors[4] = {0.0, 0.004, 0.004, 0.1};
+  unit_scratch = unit_triangle;
+  const starcat_camera *c = &unit_scratch.camera;
+  const double half[2] = {0.5 * (double)c->width_px, 0.5 * (double)c->height_px};
+  const double corner = sqrt(half[0] * half[0] + half[1] * half[1]);
+  uint64_t state = 91;
+  sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.0, SKY_SPOTS, 0, &truth);
+  for (uint32_t n = 0; n < 4u; n++) {
+    unit_scratch.options.camera_error = (starcat_real)errors[n];
+    unit_scratch.options.fov_error = (starcat_real)(n == 2u ? 0.02 : 0.0);
+    const starcat_frame frame = unit_frame_of(&truth);
+    CHECK_IS(starcat_begin_call(&call, &unit_scratch.image, &unit_scratch.camera,
+                                &unit_scratch.options, &frame, &unit_work, &unit_result),
+             STARCAT_OK);
+    CHECK_NEAR(call.half_range[0], n == 2u ? -log1p(-0.02) : n == 1u ? 0.004 : 0.05, 1e-6);
+    const int is_narrow = (n == 1u) || (n == 2u);
+    const double mean = (double)call.camera.mean_scale;
+    CHECK_NEAR(call.half_range[1], is_narrow ? 0.004 / (1.0 - mean) : 0.1, 1e-6);
+    CHECK_NEAR(call.half_range[2], is_narrow ? 0.004 * corner / half[1] : 0.1, 1e-6);
+    CHECK_NEAR(call.half_range[3], is_narrow ? 0.004 * corner / half[1] : 0.1, 1e-6);
+    CHECK_NEAR(call.half_range[4], is_narrow ? 0.004 * corner / half[0] : 0.1, 1e-6);
+    CHECK_NEAR(call.half_range[5], is_narrow ? 0.004 * corner / half[1] : 0.1, 1e-6);
+  }
+}
+
 /* Stretches and shears of 4 to 8 %, with either sign: three stars give them and the attitude, even
  * with a focal length that can be off. A shape that is out of the ranges is not tried. */
 static void check_shaped(void) {
@@ -526,6 +553,7 @@ void test_shape(void) {
   check_numbers();
   check_budgets();
   check_noises();
+  check_camera_error();
   check_shaped();
   check_unseen();
   check_limits_of_shaped();

@@ -443,9 +443,16 @@ def _camera(camera: Camera) -> Any:
 @lru_cache(maxsize=16)
 def _options(settings: Settings, fov_error: float) -> Any:
     chance = math.log(max(settings.max_false_match_probability, 1e-300))
-    # The library takes 0 for a noise that is not stated.
-    stated = settings.noise_px or 0.0, settings.noise_mag or 0.0
-    options = [settings.tolerance_px, *stated, chance, fov_error, MAX_STEPS]
+    # The library takes 0 for what is not stated.
+    options = {
+        "tolerance_px": settings.tolerance_px,
+        "noise_px": settings.noise_px or 0.0,
+        "noise_mag": settings.noise_mag or 0.0,
+        "log_chance": chance,
+        "fov_error": fov_error,
+        "camera_error": settings.camera_error or 0.0,
+        "max_steps": MAX_STEPS,
+    }
     return _onboard.ffi.new("starcat_options *", options)
 
 

@@ -424,9 +424,7 @@ class Matcher:
                 f"method {self.settings.method!r} is not in C; choose one of {', '.join(FEATURES)}"
             )
         if not has_default_search(self.settings):
-            return (
-                "it has no other selection, share of the frame, ranges and limits than the default"
-            )
+            return "it has no other selection, share of the frame and limits than the default"
         return f"{self.database.name} has too many stars or features for an onboard image"
 
     @cached_property

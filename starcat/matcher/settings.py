@@ -134,8 +134,8 @@ class Settings(SearchOptions):
         default, which is about a second. Steps of the C library are smaller, 1 to
         5 nanoseconds each; its own limit is about a second too.
     time_limit_s : float
-        Seconds that a frame may take. Infinite by default. If this, ``min_share``,
-        ``camera_error`` or ``max_steps`` is given, ``auto`` is ``numpy``.
+        Seconds that a frame may take. Infinite by default. If this, ``min_share`` or
+        ``max_steps`` is given, ``auto`` is ``numpy``.
     selection : TriangleOrder
         Order and limits of the triangles of centroids, for the methods that use triangles.
     engine : {"auto", "c", "numpy"}
@@ -196,8 +196,7 @@ class Settings(SearchOptions):
 def has_default_search(settings: Settings) -> bool:
     """Return whether the settings that only numpy supports have their defaults."""
     values = (settings.selection, settings.min_share, settings.max_steps, settings.time_limit_s)
-    is_wide = settings.camera_error is None
-    return is_wide and values == (TriangleOrder(), MIN_SHARE, MAX_STEPS, math.inf)
+    return values == (TriangleOrder(), MIN_SHARE, MAX_STEPS, math.inf)
 
 
 def certainty(settings: Settings) -> float:

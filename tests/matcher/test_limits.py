@@ -99,9 +99,7 @@ def test_limits_that_are_none_are_refused(sky):
 
 @needs_c
 def test_the_library_has_no_other_limit_of_steps(sky):
-    with pytest.raises(
-        ConfigError, match="no other selection, share of the frame, ranges and limits"
-    ):
+    with pytest.raises(ConfigError, match="no other selection, share of the frame and limits"):
         Matcher(sky, engine="c", max_steps=10)
 
 

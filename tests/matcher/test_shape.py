@@ -423,15 +423,16 @@ def test_the_error_of_a_camera_is_how_far_a_corner_may_move(camera):
     assert half_ranges(0.02, camera, 0.004)[0] == half_ranges(0.02)[0]
 
 
-def test_a_calibrated_camera_gives_up_other_shapes_and_gains_evidence(sky):
+@both_engines
+def test_a_calibrated_camera_gives_up_other_shapes_and_gains_evidence(sky, engine):
     [frame] = simulate_frames(sky.directions, sky.camera, 1, Noise(0.05), 12, sky.mag)
     px = shaped_px(frame.centroids_px, term_of(2, 0.008), sky.camera)
-    wide = Matcher(sky, engine="numpy", tolerance_px=4.0).identify(px)
-    narrow = Matcher(sky, tolerance_px=4.0, camera_error=0.01).identify(px)
+    wide = Matcher(sky, engine=engine, tolerance_px=4.0).identify(px)
+    narrow = Matcher(sky, engine=engine, tolerance_px=4.0, camera_error=0.01).identify(px)
     assert wide.ok
     assert narrow.ok
     assert narrow.false_match_probability < 0.1 * wide.false_match_probability
-    refused = Matcher(sky, tolerance_px=4.0, camera_error=0.001).identify(px)
+    refused = Matcher(sky, engine=engine, tolerance_px=4.0, camera_error=0.001).identify(px)
     assert not refused.ok
     with pytest.raises(ConfigError, match=r"camera_error is 0\.2; expected 1e-06 to 0\.1"):
         Matcher(sky, camera_error=0.2)

@@ -146,7 +146,12 @@ def _rates(
         engine.image,
         ffi.new("starcat_camera *", [*lens, *centre, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
         ffi.new(
-            "starcat_options *", [TOLERANCE_PX, 0.0, 0.0, math.log(CERTAIN), 0.0, FLIGHT_STEPS]
+            "starcat_options *",
+            {
+                "tolerance_px": TOLERANCE_PX,
+                "log_chance": math.log(CERTAIN),
+                "max_steps": FLIGHT_STEPS,
+            },
         ),
         engine.rows,
     ]

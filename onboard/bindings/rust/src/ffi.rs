@@ -76,6 +76,9 @@ pub struct Options {
     pub log_chance: Real,
     /// Largest relative error of the focal length, which is then found too.
     pub fov_error: Real,
+    /// Largest error of a calibrated camera at the corners, as a share of the half diagonal; 0: not
+    /// stated.
+    pub camera_error: Real,
     /// Bound on the work.
     pub max_steps: u32,
 }
