@@ -1,7 +1,7 @@
 """Hard acquisition: many stars missing, as many false ones, and noise of 1 or 5 px.
 
-    python benchmarks/acquisition.py [--frames 2000] [--peers]
-    python benchmarks/acquisition.py --sequences 500
+    python benchmarks/acquisition.py [--frames 2000] [--camera-error 0.002] [--peers]
+    python benchmarks/acquisition.py --sequences 500 [--camera-error 0.002]
 
 Frames are of ``sao15``, the preset ``sao-12deg`` with a field of 15 deg. Magnitudes have a noise of
 0.3. Each star is missing with a probability, and there are as many false spots as stars are missing
@@ -18,6 +18,8 @@ With ``--sequences`` only sequences of three frames, 1 s apart, are identified b
 camera turns at a constant rate of up to 0.8 deg/s, and the noise is stated. A sequence ends with
 its first answer. A fourth of the sequences without a sky, and of those with priors that are wrong
 by 3 deg where 1 deg is allowed, is made in addition: none of them may have a wrong answer.
+
+The lens of these frames is exactly the stated one. ``--camera-error`` states that it is calibrated.
 """
 
 from __future__ import annotations
@@ -125,10 +127,13 @@ def made_frame(
     return simulate_frame(sky, camera, matrix, noise, generator)
 
 
-def try_sequences(database: Path, kind: Kind, what: str, count: int) -> Counter[str]:
+def try_sequences(
+    database: Path, kind: Kind, what: str, count: int, calibrated: dict[str, float]
+) -> Counter[str]:
     """Identify sequences of a row; return how they ended."""
     generator = np.random.default_rng([SEED, KINDS.index(kind), len(what)])
-    matcher = Matcher.open(database, noise_px=kind.noise_px, noise_mag=NOISE_MAG)
+    stated = {"noise_px": kind.noise_px, "noise_mag": NOISE_MAG} | calibrated
+    matcher = Matcher.open(database, **stated)
     stars, sky = matcher.database, sky_of(matcher.database)
     scene, ended = Scene(stars, stars, kind.noise_px), Counter[str]()
     for attitude in random_attitudes(count, generator):
@@ -164,13 +169,13 @@ def _turn(generator: np.random.Generator, angle_deg: float) -> Turn:
     return float(x * scale), float(y * scale), float(z * scale)
 
 
-def print_sequences(database: Path, count: int, rows: Rows) -> None:
+def print_sequences(database: Path, count: int, calibrated: dict[str, float], rows: Rows) -> None:
     """Print how sequences of three frames ended."""
     print(f"{'':31}  right  alone  confirmed  wrong  none")
     for what in ("sky", "no sky", "wrong prior"):
         for kind in KINDS:
             number = count if what == "sky" else max(1, count // 4)
-            ended = try_sequences(database, kind, what, number)
+            ended = try_sequences(database, kind, what, number, calibrated)
             right = 100.0 * (ended["alone"] + ended["confirmed"]) / number
             print(
                 f"{what:12} {kind.name:17} {right:6.2f}% {ended['alone']:6}{ended['confirmed']:11}"
@@ -270,12 +275,14 @@ def main(rows: Rows) -> None:
     options.size("--frames", 2000, 20, "frames of each row")
     options.add_argument("--peers", action="store_true", help="ask other identifiers, too")
     options.add_argument("--sequences", type=int, help="only sequences, this many of each row")
+    options.add_argument("--camera-error", type=float, help="stated error of a calibrated camera")
     asked = options.asked()
+    calibrated = {} if asked.camera_error is None else {"camera_error": asked.camera_error}
     with tempfile.TemporaryDirectory() as scratch:
         changes = {"name": '"sao15"', "camera.fov_x_deg": FIELD_DEG}
         folder = database("sao-12deg", Path(scratch), changes).folder
         if asked.sequences:
-            print_sequences(folder, asked.sequences, rows)
+            print_sequences(folder, asked.sequences, calibrated, rows)
             return
         stars = Matcher.open(folder).database
         made = {kind.name: made_frames(stars, kind, asked.frames) for kind in KINDS}
@@ -283,7 +290,7 @@ def main(rows: Rows) -> None:
         print(f"{'':34}  right  wrong  mean ms   median     most   missed  refused")
         for kind in KINDS:
             few = made[kind.name][: max(20, asked.frames // PART_ALONE)]
-            stated = {"noise_px": kind.noise_px, "noise_mag": NOISE_MAG}
+            stated = {"noise_px": kind.noise_px, "noise_mag": NOISE_MAG} | calibrated
             print_row(
                 "without votes", kind, solve(folder, kind, few, stated, votes=False), len(few)
             )
@@ -292,7 +299,7 @@ def main(rows: Rows) -> None:
                 stated = {"noise_px": kind.noise_px, "noise_mag": NOISE_MAG}
                 if who != "noise stated":
                     stated = {"tolerance_px": 3.0 * kind.noise_px} if who == "magnitudes" else {}
-                found = solve(folder, kind, made[kind.name], stated)
+                found = solve(folder, kind, made[kind.name], stated | calibrated)
                 print_row(who, kind, found, asked.frames)
                 wrong = found.verdicts.keys() - {"right", "none"}
                 rows.expect(not wrong, f"{who}, {kind.name}: wrong answers")
