@@ -409,13 +409,17 @@ static uint32_t search_shaped(const unit_sky *sky, uint32_t most) {
 static void check_camera_error(void) {
   static const double errors[4] = {0.0, 0.004, 0.004, 0.1};
   unit_scratch = unit_triangle;
-  const starcat_camera *c = &unit_scratch.camera;
+  starcat_camera *c = &unit_scratch.camera;
   const double half[2] = {0.5 * (double)c->width_px, 0.5 * (double)c->height_px};
   const double corner = sqrt(half[0] * half[0] + half[1] * half[1]);
   uint64_t state = 91;
   sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.0, SKY_SPOTS, 0, &truth);
   for (uint32_t n = 0; n < 4u; n++) {
     unit_scratch.options.camera_error = (starcat_real)errors[n];
+    if (n == 3u) { /* another corner is the farthest */
+      c->x0_px += (starcat_real)10.0;
+      c->y0_px += (starcat_real)10.0;
+    }
     unit_scratch.options.fov_error = (starcat_real)(n == 2u ? 0.02 : 0.0);
     const starcat_frame frame = unit_frame_of(&truth);
     CHECK_IS(starcat_begin_call(&call, &unit_scratch.image, &unit_scratch.camera,
