@@ -417,8 +417,8 @@ static void check_camera_error(void) {
   for (uint32_t n = 0; n < 4u; n++) {
     unit_scratch.options.camera_error = (starcat_real)errors[n];
     if (n == 3u) { /* another corner is the farthest */
-      c->x0_px += (starcat_real)10.0;
-      c->y0_px += (starcat_real)10.0;
+      c->x0_px -= (starcat_real)10.0;
+      c->y0_px -= (starcat_real)10.0;
     }
     unit_scratch.options.fov_error = (starcat_real)(n == 2u ? 0.02 : 0.0);
     const starcat_frame frame = unit_frame_of(&truth);
