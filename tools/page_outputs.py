@@ -232,7 +232,7 @@ def marked(printed: str) -> list[str]:
 
 def _compared(line: str) -> list[str]:
     """Return the words of a line, those that vary without their figures."""
-    return re.sub(r"~[^\s,;)]+", "~", line).split()
+    return re.sub(r"~[^\s;)]*[^\s,;)]", "~", line).split()
 
 
 def is_same_word(shown: str, printed: str) -> bool:

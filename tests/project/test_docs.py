@@ -108,6 +108,8 @@ def test_every_command_of_a_page_prints_what_the_page_shows(name, catalogs, tmp_
         ("time_s  ~0.0006", "time_s  ~1.25", True),
         ("time_s  ~0.0006", "time_s  0.0006", False),
         ("6,713 stars, ~4 s", "6,713 stars, ~11 s", True),
+        ("~60,097,760 bytes, 3 files", "~60,095,603 bytes, 3 files", True),
+        ("~60,097,760 bytes, 3 files", "~60,095,603 bytes, 4 files", False),
         ("6,713 stars, ~4 s", "6,714 stars, ~4 s", False),
     ],
 )
