@@ -65,6 +65,7 @@ def test_a_simulated_frame_is_drawn_measured_and_identified(client, simulated):
     assert ">identified<" in answer.text
     assert error_rad(answer.text, simulated.matrix) < 2e-3
     [picture] = re.findall(r'<img src="data:image/svg[+]xml;base64,([^"]+)"', answer.text)
+    assert answer.text.count(picture) == 1  # it is most of the page
     drawn = ElementTree.fromstring(base64.b64decode(picture))
     x, top, *size = map(float, drawn.get("viewBox").split())
     assert min(x, top) > 40  # without the margins

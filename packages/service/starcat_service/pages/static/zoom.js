@@ -20,6 +20,7 @@ function startZoom(figure) {
   };
   const tools = figure.querySelector(".zoom-tools");
   tools.hidden = false;
+  tools.querySelector("a[download]").href = picture.src; // the page holds the picture once
   tools.addEventListener("click", (event) => {
     const by = event.target.closest("[data-zoom]")?.dataset.zoom;
     if (by) set(by === "0" ? 1 : zoom * Number(by));
