@@ -189,7 +189,7 @@ def why_refused(stars: MatcherDatabase, settings: Settings, frame: SimulatedFram
     """Return why the true attitude is not accepted; "missed" if it would be accepted."""
     given = as_frame(frame.centroids_px, stars.camera, frame.mag)
     observation = observe(given, settings)
-    found = agree(pose_at(frame.matrix, 1.0, observation), observation, stars)
+    found = agree(pose_at(frame.matrix, 1.0, observation), observation, stars, CERTAIN)
     if found.false_match_probability <= CERTAIN:
         return "missed"
     return found.withheld or "chance"

@@ -4,7 +4,6 @@
  */
 #include "internal.h"
 
-#define LOG_CERTAIN R(-20.723265836946411156) /* of 1e-9 */
 #define WIDEST_FOV_ERROR R(0.5)
 #define MOST_CAMERA_ERROR R(0.1)
 #define MOST_NOISE_MAG R(1e6)
@@ -16,7 +15,7 @@ starcat_status starcat_set_default_options(starcat_options *options) {
   options->tolerance_px = R(2.0);
   options->noise_px = R(0.0);
   options->noise_mag = R(0.0);
-  options->log_chance = LOG_CERTAIN;
+  options->log_chance = STARCAT_LOG_CERTAIN;
   options->fov_error = R(0.0);
   options->camera_error = R(0.0);
   options->max_steps = 4000000u;
@@ -152,7 +151,7 @@ static void set_limits(starcat_call *call, const starcat_options *options) {
       call->own->has_magnitudes != 0u ? STARCAT_MAG_DEVIATIONS * options->noise_mag : R(0.0);
   call->log_limit = options->log_chance;
   /* A higher limit accepts more, but ends no search earlier. */
-  call->log_certain = starcat_smaller(options->log_chance, LOG_CERTAIN);
+  call->log_certain = starcat_smaller(options->log_chance, STARCAT_LOG_CERTAIN);
 }
 
 starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image,

@@ -34,6 +34,7 @@
 #define STARCAT_CURVATURE (R(2.0) / R(3.0))
 #define STARCAT_REFINEMENTS 4u
 #define STARCAT_STEPS_FROM_AFAR 16u /* of Newton's method, from a rough or damaged attitude */
+#define STARCAT_LOG_CERTAIN R(-20.723265836946411156) /* of 1e-9 */
 #define STARCAT_LOG_LIKELY \
   R(-6.907755278982137)               /* logarithm of 1e-3: the attitude is likely, not certain */
 #define STARCAT_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
@@ -264,6 +265,7 @@ real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx
 
 /* verify.c */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
+uint32_t starcat_count_fewer(const starcat_call *call);
 int starcat_spend_on_bound(const starcat_call *call);
 real starcat_find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
                          uint32_t centroid, real offset[2]);

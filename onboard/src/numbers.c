@@ -30,30 +30,23 @@ int starcat_are_finite(const real *numbers, uint32_t count) {
   return finite;
 }
 
-/* Logarithm of a factorial, from 16 on by Stirling's series. */
+/* Logarithm of a factorial, from 8 on by Stirling's series. */
 real starcat_log_factorial(uint32_t n) {
-  static const real table[16] = {R(0.0),
-                                 R(0.0),
-                                 R(0.69314718055994530942),
-                                 R(1.7917594692280550008),
-                                 R(3.1780538303479456197),
-                                 R(4.7874917427820459943),
-                                 R(6.5792512120101009951),
-                                 R(8.5251613610654143002),
-                                 R(10.604602902745250228),
-                                 R(12.801827480081469611),
-                                 R(15.104412573075515295),
-                                 R(17.502307845873885839),
-                                 R(19.987214495661886150),
-                                 R(22.552163853123422886),
-                                 R(25.191221182738681500),
-                                 R(27.899271383840891566)};
-  if (n < 16u) {
+  static const real table[8] = {R(0.0),
+                                R(0.0),
+                                R(0.69314718055994530942),
+                                R(1.7917594692280550008),
+                                R(3.1780538303479456197),
+                                R(4.7874917427820459943),
+                                R(6.5792512120101009951),
+                                R(8.5251613610654143002)};
+  if (n < 8u) {
     return table[n];
   }
   const real x = (real)n, inverse = R(1.0) / x, square = inverse * inverse;
   return (x + R(0.5)) * STARCAT_LOG(x) - x + R(0.91893853320467274178) +
-         inverse * (R(1.0 / 12.0) - square * (R(1.0 / 360.0) - square * R(1.0 / 1260.0)));
+         inverse * (R(1.0 / 12.0) -
+                    square * (R(1.0 / 360.0) - square * (R(1.0 / 1260.0) - square * R(1.0 / 1680.0))));
 }
 
 /* Exponential of a number from -1 to 20, without another function of libm. */

@@ -6,7 +6,8 @@
  *             project the stars on the detector
  *             match centroids and stars that are nearest to each other
  *             refine the attitude on them
- *         judge: bound the probability that chance matches as many as well  [chance.c]
+ *         judge: bound the probability that chance matches as many as well  [chance.c];
+ *             until it is certain, leave out the farthest star while that lowers it
  *         if its residuals are not those of noise, or much of the frame is
  *         unexplained: fit again with a shape of the frame  [shape.c]
  *             withhold it if its stars do not determine the boresight whatever the shape is
@@ -23,8 +24,6 @@
 #define STEPS_OF_FACE 48u  /* of a face of the box of ranges in its bound */
 #define STEPS_OF_CHECK 512u /* to check what the stars determine, besides its centroids */
 #define PLAIN_SHARE (R(2.0) / R(3.0))
-#define LOG_SHARE_OF_PLAIN R(-0.10536051565782630)   /* of 0.9 */
-#define LOG_SHARE_OF_SHAPE R(-3.6888794541139363057) /* of 0.1 over the number of other models */
 #define SHAPE_CHANCE R(1e-4)
 #define SHAPE_STEPS 2u
 #define LEAST_NOISE_PX R(1e-3) /* noise below which residuals show no shape */
@@ -272,11 +271,15 @@ static uint32_t fit_matches(starcat_call *call, real m[9], uint32_t doubled, uin
   return matched;
 }
 
+/* The number of centroids, or of stars of the field if they are fewer. */
+uint32_t starcat_count_fewer(const starcat_call *call) {
+  return call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
+}
+
 /* Take the steps of the bound of an agreement. Magnitudes cost most: every centroid is compared
  * with every star, and polynomials of both are summed. Returns 0 if the budget is used up. */
 int starcat_spend_on_bound(const starcat_call *call) {
-  const uint32_t most =
-      call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
+  const uint32_t most = starcat_count_fewer(call);
   uint32_t steps = STEPS_OF_MATCH * (call->own->count + call->own->n_within);
   if (call->mag_reach > R(0.0)) {
     steps +=
@@ -285,18 +288,70 @@ int starcat_spend_on_bound(const starcat_call *call) {
   return starcat_spend_steps(call, steps);
 }
 
+/* Take the steps of the bound of an agreement with the first `free` terms of a shape. */
+static int spend_on_model(const starcat_call *call, uint32_t free) {
+  return starcat_spend_on_bound(call) &&
+         ((free == 0u) || starcat_spend_steps(call, STEPS_OF_FACE << free));
+}
+
 static void withhold_agreement(starcat_agreement *found, uint32_t reason) {
   found->withheld = reason;
   found->log_chance = R(0.0);
 }
 
+/* The match that is farthest from its star. */
+static uint32_t find_farthest_match(const starcat_call *call) {
+  const starcat_workspace *w = call->work;
+  real most = R(-1.0);
+  uint32_t farthest = 0;
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    if ((w->match[i] >= 0) && (w->match_square[i] > most)) {
+      most = w->match_square[i];
+      farthest = i;
+    }
+  }
+  return farthest;
+}
+
+/* Bound the probability that chance matches as well as the matches in the workspace. The bound counts
+ * every choice of stars: until it is certain, the farthest match is left out while that lowers it. */
+static void bound_matches(const starcat_call *call, uint32_t free,
+                          const real terms[STARCAT_SHAPE_TERMS], starcat_agreement *found) {
+  starcat_workspace *w = call->work;
+  uint32_t n = found->n_matched, last = 0;
+  int16_t star = w->match[last];
+  int goes_on = 1;
+  real square_px = R(0.0);
+  starcat_count_ways(call, call->noise_px > R(0.0) ? starcat_count_fewer(call) : n);
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    square_px += w->match[i] >= 0 ? w->match_square[i] : R(0.0);
+  }
+  while (goes_on != 0) {
+    const real log_bound = starcat_log_chance(call, square_px, n, free, terms);
+    goes_on = 0;
+    if (log_bound < found->log_bound) {
+      found->n_matched = n;
+      found->square_px = square_px;
+      found->log_bound = log_bound;
+      if ((log_bound > call->log_certain) && spend_on_model(call, free)) {
+        last = find_farthest_match(call);
+        star = w->match[last];
+        w->match[last] = -1;
+        square_px -= w->match_square[last];
+        n--;
+        goes_on = 1;
+      }
+    } else {
+      w->match[last] = star;
+    }
+  }
+}
+
 /* Judge the fit in the workspace, with the first `free` terms of a shape. */
 static void judge_fit(const starcat_call *call, const real m[9], uint32_t matched, uint32_t free,
                       const real terms[STARCAT_SHAPE_TERMS], starcat_agreement *found) {
-  starcat_workspace *w = call->work;
-  const uint32_t fewer =
-      call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
-  real square_px = R(0.0), square_rad = R(0.0);
+  const starcat_workspace *w = call->work;
+  real square_rad = R(0.0);
   for (uint32_t k = 0; k < 9u; k++) {
     found->matrix[k] = m[k];
   }
@@ -315,11 +370,11 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
   if (matched < STARCAT_MIN_STARS) {
     return;
   }
-  if (!starcat_spend_on_bound(call) ||
-      ((free > 0u) && !starcat_spend_steps(call, STEPS_OF_FACE << free))) {
+  if (!spend_on_model(call, free)) {
     found->n_matched = 0; /* as if nothing had matched */
     return;
   }
+  bound_matches(call, free, terms, found);
   for (uint32_t i = 0; i < call->own->count; i++) {
     found->star[i] = STARCAT_NO_STAR;
     if (w->match[i] >= 0) {
@@ -327,14 +382,11 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
       real body[3];
       starcat_turn(m, w->near_icrs[j], body);
       square_rad += starcat_chord_square(call->body[i], body);
-      square_px += w->match_square[i];
       found->star[i] = (int32_t)w->near_row[j];
     }
   }
-  found->residual_rad = STARCAT_SQRT(square_rad / (real)matched);
-  found->square_px = square_px;
-  found->share = starcat_smaller((real)matched / (real)fewer, R(1.0));
-  found->log_bound = starcat_log_chance(call, square_px, matched, free, terms);
+  found->residual_rad = STARCAT_SQRT(square_rad / (real)found->n_matched);
+  found->share = starcat_smaller((real)found->n_matched / (real)starcat_count_fewer(call), R(1.0));
   found->log_chance = found->log_bound;
 }
 
@@ -367,13 +419,6 @@ static int use_agreement(starcat_call *call, const starcat_agreement *from,
   return starcat_use_shape(call, terms);
 }
 
-/* Weigh an agreement by the share of the probability that its model has. */
-static void allot_chance(starcat_agreement *found, uint32_t free) {
-  const real log_share = free == 0u ? LOG_SHARE_OF_PLAIN : LOG_SHARE_OF_SHAPE;
-  found->log_bound = starcat_smaller(found->log_bound - log_share, R(0.0));
-  found->log_chance = found->log_bound;
-}
-
 /* Fit nested models of the frame, each from where the previous one ended; keep the best one. */
 static void try_shapes(starcat_call *call) {
   static const uint32_t MODELS[5] = {0, 1, 2, 4, 6};
@@ -402,7 +447,6 @@ static void try_shapes(starcat_call *call) {
     const uint32_t matched = good != 0 ? fit_matches(call, m, DOUBLED_FOR_SHAPE, free, terms) : 0u;
     if ((matched > 0u) || (free == 0u)) {
       judge_fit(call, m, matched, free, terms, &w->wider);
-      allot_chance(&w->wider, free);
       if (w->wider.log_bound < R(0.0)) {
         w->start = w->wider;
       }
@@ -446,9 +490,12 @@ static real find_weight(const starcat_call *call, uint32_t centroid) {
 static void sum_stars(const starcat_call *call, const starcat_agreement *found, const real m[9],
                       starcat_normal *n, squares *s) {
   const starcat_normal none = {{{R(0.0)}}, {R(0.0)}};
-  const squares nothing = {R(0.0), R(0.0), R(0.0), R(1e30), 1};
   *n = none;
-  *s = nothing;
+  s->px = R(0.0);
+  s->rad = R(0.0);
+  s->chi = R(0.0);
+  s->least_chi = R(1e30);
+  s->is_stated = 1;
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (found->star[i] >= 0) {
       real offset[2];
@@ -489,25 +536,21 @@ static int determines_frame(const starcat_call *call, const starcat_agreement *f
 /* How often noise lowers the squares from a gain of `own` terms to one of `all` six, or more:
  * Fisher's F, or chi-square if the noise is stated. */
 static real chance_of_shape(const starcat_agreement *found, const squares *s, real own, real all) {
-  const real gain = all - own;
-  if (s->is_stated != 0) {
-    const real half = R(0.5) * starcat_larger(gain, R(0.0));
-    return half < R(60.0) ? (R(1.0) + half * (R(1.0) + R(0.5) * half)) / starcat_exponential(half)
-                          : R(0.0);
+  const real gain = starcat_larger(all - own, R(0.0));
+  real power = R(0.5) * gain, sum = R(1.0) + power * (R(1.0) + R(0.5) * power);
+  if (s->is_stated == 0) {
+    if (2u * found->n_matched <= STARCAT_UNKNOWNS) {
+      return R(1.0);
+    }
+    const real half = R(0.5) * (real)(2u * found->n_matched - STARCAT_UNKNOWNS);
+    const real gone = gain / starcat_larger(s->chi - own, s->least_chi);
+    if (!(gone < R(1.0))) {
+      return R(0.0);
+    }
+    power = -half * STARCAT_LOG(R(1.0) - gone);
+    sum = R(1.0) + half * gone * (R(1.0) + R(0.5) * (half + R(1.0)) * gone);
   }
-  if (2u * found->n_matched <= STARCAT_UNKNOWNS) {
-    return R(1.0);
-  }
-  const real half = R(0.5) * (real)(2u * found->n_matched - STARCAT_UNKNOWNS);
-  const real part = gain / starcat_larger(s->chi - own, s->least_chi);
-  const real gone = starcat_smaller(starcat_larger(part, R(0.0)), R(1.0));
-  if (!(gone < R(1.0))) {
-    return R(0.0);
-  }
-  const real power = -half * STARCAT_LOG(R(1.0) - gone);
-  return power < R(60.0) ? (R(1.0) + half * gone * (R(1.0) + R(0.5) * (half + R(1.0)) * gone)) /
-                               starcat_exponential(power)
-                         : R(0.0);
+  return power < R(60.0) ? sum / starcat_exponential(power) : R(0.0);
 }
 
 /* Fit the whole shape to the stars of an agreement, whose places are in use, from a first step. */
@@ -601,7 +644,6 @@ static int settle_agreement(starcat_call *call) {
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
   if (found->log_bound < R(0.0)) {
-    allot_chance(found, found->free);
     const int plain = is_plain(call, found);
     if (plain == 0) {
       try_shapes(call);

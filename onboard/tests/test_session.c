@@ -533,7 +533,7 @@ static void check_same_spots(void) {
 /* False spots, which are others in each frame, and now and then the same. */
 static void check_false_spots(void) {
   uint32_t chains = 0;
-  for (uint32_t seed = 1; seed <= 40u; seed++) {
+  for (uint32_t seed = 1; seed <= 120u; seed++) {
     sky_frame whole;
     begin_weak(seed, &whole);
     whole.count = 0;

@@ -297,9 +297,8 @@ def identify_blind(
         rows = np.append(best.part.level.rows, -1)  # a centroid without a star has row -1
         index = np.full(len(best.whole), -1, dtype=np.int32)
         index[: len(agreement.star_index)] = rows[agreement.star_index]
-        agreement = replace(
-            agreement, star_index=index, chance=min(1.0, len(parts) * agreement.chance)
-        )
+        log_chance = min(0.0, agreement.log_chance + math.log(len(parts)))
+        agreement = replace(agreement, star_index=index, log_chance=log_chance)
     return result_of_search(agreement, best.whole, database, limit)
 
 

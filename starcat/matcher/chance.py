@@ -53,6 +53,7 @@ import numpy as np
 
 from starcat.arrays import Array, Mask
 from starcat.geometry.camera import Camera
+from starcat.matcher.settings import CERTAIN
 
 LOG_ALL_ATTITUDES = math.log(8.0 * math.pi**2)
 """Logarithm of the volume of all rotations, cubic radians."""
@@ -62,14 +63,11 @@ NO_TERMS = np.empty(0)
 MIN_STARS = 4
 """Smallest number of matched stars: three determine an attitude, a fourth confirms it."""
 
-NEARLY_CERTAIN = 1e-7
-"""Largest expected number of agreements of true stars that are likely to be answers."""
-
 NEXT_SHARE = 0.1
 """Share of a number of stars over the share of the next number towards the typical one."""
 
 
-def false_match_probability(
+def log_false_match_probability(
     square_px: float,
     rows: Array,
     n_centroids: int,
@@ -82,7 +80,7 @@ def false_match_probability(
     log_growth: float = 0.0,
     log_attitudes: float = LOG_ALL_ATTITUDES,
 ) -> float:
-    """Bound the probability that random centroids agree as well with any attitude.
+    """Bound the probability that random centroids agree as well with any attitude: its logarithm.
 
     ``square_px`` is the sum of the squared residuals. ``rows``, shape (N, 2, 3 + d), are the
     derivatives of the places of the centroids that agree, in pixels, by three angles and by the d
@@ -92,7 +90,7 @@ def false_match_probability(
     n = len(rows)
     stars = max(n, stars_in_frame)
     if noise_px is not None and n < MIN_STARS:
-        return 1.0
+        return 0.0
     most = n if noise_px is None else min(n_centroids, stars)
     assignments: Callable[[int], float] = partial(
         log_assignments, n_centroids=n_centroids, stars=stars
@@ -112,13 +110,13 @@ def false_match_probability(
             sign, log_determinant = np.linalg.slogdet(gram[np.ix_(columns, columns)])
             if sign <= 0 or 2 * n <= len(columns):
                 if not terms:
-                    return 1.0
+                    return 0.0
                 continue  # these terms move no place: the face has no volume
             box = sum(math.log(2.0 * half_ranges[term]) for term in terms)
             log_root = 0.5 * log_determinant + log_attitudes - LOG_ALL_ATTITUDES
             face = _log_expected(assignments(n), n, square_px, log_root, camera, len(columns))
             total = float(np.logaddexp(total, box + face))
-    return math.exp(min(0.0, total + log_growth + log_values))
+    return min(0.0, total + log_growth + log_values)
 
 
 class FrameEvidence(NamedTuple):
@@ -141,8 +139,8 @@ def evidence_of_frame(
 ) -> FrameEvidence | None:
     """Return the evidence of the spots of a frame; None if they determine no attitude.
 
-    The parameters are those of `false_match_probability`, but ``log_area`` is the logarithm of the
-    area where the spots can be, pixels squared.
+    The parameters are those of `log_false_match_probability`, but ``log_area`` is the logarithm of
+    the area where the spots can be, pixels squared.
     """
     n = len(rows)
     if n < 2:
@@ -190,7 +188,7 @@ def largest_squares_px(
 ) -> Array:
     """Return the largest sums of squared residuals of n stars that are answers, pixels squared.
 
-    For these sums `false_match_probability` returns ``limit``, if ``noise_px`` is stated.
+    For these sums the bound (`log_false_match_probability`) is ``limit``, if the noise is stated.
     ``information`` are determinants of sums of the squared derivatives (`place_information`).
     """
     most = min(n_centroids, stars_in_frame)
@@ -244,42 +242,42 @@ def _log_share(
 ) -> float:
     """Return the logarithm of the share of n, which is at most ``most``.
 
-    The typical number of stars, n*, is the smallest whose agreements are `NEARLY_CERTAIN` if
-    their stars are spread over the whole frame and the squared residuals are what the noise
-    makes on average. If no number is, it is the largest possible one.
+    The typical number of stars, n*, is the smallest that is `CERTAIN` (`_typical_number`).
     """
-    numbers = range(MIN_STARS, most + 1)
-    square_of_frame = (camera.width_px**2 + camera.height_px**2) / 12.0
-    log_spread = math.log(square_of_frame) + 4.0 * math.log(camera.focal_length_px)
-    typical = numbers[-1]
-    for number in numbers:
-        square_px = (2 * number - 3) * noise_px**2
-        log_root = 0.5 * (3.0 * math.log(number) + log_spread)
-        log_root += log_attitudes - LOG_ALL_ATTITUDES
-        expected = _log_expected(assignments(number), number, square_px, log_root, camera)
-        if expected <= math.log(NEARLY_CERTAIN):
-            typical = number
-            break
-    total = sum(NEXT_SHARE ** abs(number - typical) for number in numbers)
+    typical = _typical_number(most, assignments, noise_px, camera, CERTAIN, log_attitudes)
+    total = sum(NEXT_SHARE ** abs(number - typical) for number in range(MIN_STARS, most + 1))
     return abs(n - typical) * math.log(NEXT_SHARE) - math.log(total)
 
 
 def least_matches(
     n_centroids: int, stars: int, camera: Camera, noise_px: float, limit: float
 ) -> int:
-    """Return the smallest number of matches that is typically accepted, with ``stars`` in a frame.
+    """Return the smallest number of matches that is typically accepted, of ``stars`` in a frame."""
+    assignments = partial(log_assignments, n_centroids=n_centroids, stars=stars)
+    return _typical_number(min(n_centroids, stars), assignments, noise_px, camera, limit)
+
+
+def _typical_number(
+    most: int,
+    assignments: Callable[[int], float],
+    noise_px: float,
+    camera: Camera,
+    limit: float,
+    log_attitudes: float = LOG_ALL_ATTITUDES,
+) -> int:
+    """Return the smallest number whose agreements are expected at most ``limit`` times.
 
     Their residuals are what noise makes on average, and they are spread over the whole frame. If
-    no number is accepted, it is the largest possible one.
+    no number is that rare, it is the largest possible one, ``most``.
     """
     square_of_frame = (camera.width_px**2 + camera.height_px**2) / 12.0
     log_spread = math.log(square_of_frame) + 4.0 * math.log(camera.focal_length_px)
-    most = min(n_centroids, stars)
+    log_spread += 2.0 * (log_attitudes - LOG_ALL_ATTITUDES)
     for number in range(MIN_STARS, most):
         square_px = (2 * number - 3) * noise_px**2
         log_root = 0.5 * (3.0 * math.log(number) + log_spread)
-        ways = log_assignments(number, n_centroids, stars)
-        if _log_expected(ways, number, square_px, log_root, camera) <= math.log(limit):
+        expected = _log_expected(assignments(number), number, square_px, log_root, camera)
+        if expected <= math.log(limit):
             return number
     return most
 

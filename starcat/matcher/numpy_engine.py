@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from starcat.geometry.attitude import solve_wahba_svd
 from starcat.matcher.chance import MIN_STARS, log_attitudes_within
 from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.methods import triangle, votes
@@ -210,13 +209,9 @@ def _answer_of(
 ) -> MatchResult:
     """Return the answer that an agreement is."""
     pose, matched = agreement.pose, agreement.matched
-    matrix, residual_rad = pose.matrix, agreement.residual_rad
     stars = database.directions[agreement.star_index[matched]]
-    if observation.sigma_px is not None:
-        sigma_px = observation.sigma_px[matched]
-        matrix, residual_rad = fit_by_weights(pose.body[matched], stars, sigma_px)
-    elif pose.shape.free:
-        matrix = solve_wahba_svd(pose.body[matched], stars)
+    sigma_px = None if observation.sigma_px is None else observation.sigma_px[matched]
+    matrix, residual_rad = fit_by_weights(pose.body[matched], stars, sigma_px)
     error_px = None
     if observation.fov_error and not pose.shape.free:
         error_px = focal_length_error_px(

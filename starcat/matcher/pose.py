@@ -223,9 +223,11 @@ def weights_of(sigma_px: Array) -> Array:
     return np.asarray(np.maximum((least / noise_px) ** 2, MIN_WEIGHT))
 
 
-def fit_by_weights(seen: Directions, stars: Directions, sigma_px: Array) -> tuple[Matrix, float]:
+def fit_by_weights(
+    seen: Directions, stars: Directions, sigma_px: Array | None
+) -> tuple[Matrix, float]:
     """Return the attitude that fits centroids best by their noise, and its residual, radians."""
-    matrix = solve_wahba_svd(seen, stars, weights_of(sigma_px))
+    matrix = solve_wahba_svd(seen, stars, None if sigma_px is None else weights_of(sigma_px))
     difference = seen - stars @ matrix.T
     return matrix, math.sqrt(float(np.vdot(difference, difference)) / len(seen))
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Mask, Matrix, Pixels, Rows
-from starcat.matcher.chance import MIN_STARS, false_match_probability
+from starcat.matcher.chance import MIN_STARS, log_false_match_probability
 from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import (
@@ -100,12 +100,18 @@ class Agreement:
     # Root mean square separation of the matched centroids from their stars; NaN if fewer than
     # `MIN_STARS` match.
     residual_rad: float
-    # Bound on the probability that chance agrees as well; 1 if fewer than `MIN_STARS` match.
-    chance: float
+    # Logarithm of the bound on the probability that chance agrees as well; 0 if fewer than
+    # `MIN_STARS` match.
+    log_chance: float
     # Fraction of the centroids, or of the stars of the frame if they are fewer, that match.
     share: float = 0.0
     withheld: Withheld = None  # why it is not an answer, even if chance is unlikely
     square_px2: float = math.nan  # sum of the squared residuals
+
+    @property
+    def chance(self) -> float:
+        """Bound on the probability that chance agrees as well."""
+        return math.exp(self.log_chance)
 
     @property
     def false_match_probability(self) -> float:
@@ -113,15 +119,12 @@ class Agreement:
         return 1.0 if self.withheld else self.chance
 
     def is_better_than(self, other: Agreement | None) -> bool:
-        """Return whether chance explains it less; withheld agreements are compared too.
-
-        The probability of hundreds of stars can be too small for a number: then more are better.
-        """
+        """Return whether chance explains it less; withheld agreements are compared too."""
         return other is None or self._rank < other._rank
 
     @property
-    def _rank(self) -> tuple[float, float, int]:
-        return self.false_match_probability, self.chance, 0 if self.chance else -self.n_matched
+    def _rank(self) -> tuple[float, float]:
+        return 0.0 if self.withheld else self.log_chance, self.log_chance
 
     @property
     def matched(self) -> Rows:
@@ -190,8 +193,8 @@ def verify_shaped(
     for candidates in batches:
         for pose in shaped_poses(candidates, observation, database.directions):
             refined = _refine(pose, observation, database, WIDER, free=FREE_TERMS)
-            agreement = _agreement_of(refined, observation, FREE_TERMS)
-            if agreement.chance < 1.0:
+            agreement = _agreement_of(refined, observation, FREE_TERMS, best.certain)
+            if agreement.log_chance < 0.0:
                 best.offer(_with_shape(agreement, observation, database, best.certain))
             if best.is_certain:
                 return
@@ -240,7 +243,7 @@ def agree(
 ) -> Agreement:
     """Match the centroids of a frame with the stars that an attitude predicts."""
     rough = ROUGH if observation.fov_error and not first else first
-    agreement = _agreement_of(_refine(pose, observation, database, rough), observation)
+    agreement = _agreement_of(_refine(pose, observation, database, rough), observation, 0, certain)
     return _with_shape(agreement, observation, database, certain)
 
 
@@ -252,9 +255,9 @@ def _with_shape(
     The attitude of an agreement without a shape is right only if the frame has the shape that the
     camera says. If its residuals are small, it is, and no shape is tried.
     """
-    if not agreement.chance < 1.0:
+    if not agreement.log_chance < 0.0:
         return agreement
-    best, pose = _allotted(agreement, agreement.pose.shape.free), agreement.pose
+    best, pose = agreement, agreement.pose
     if _is_plain(best, observation, certain):
         return _checked(best, observation, database, is_plain=True)
     for free in MODELS:
@@ -263,18 +266,12 @@ def _with_shape(
         if free and not pose.shape.free:
             pose = shaped(pose, observation)
         refined = _refine(pose, observation, database, WIDER, free=free)
-        other = _allotted(_agreement_of(refined, observation, free), free)
-        if other.chance < 1.0:
+        other = _agreement_of(refined, observation, free, certain)
+        if other.log_chance < 0.0:
             pose = other.pose
         if other.is_better_than(best):
             best = other
     return _checked(best, observation, database)
-
-
-def _allotted(agreement: Agreement, free: int) -> Agreement:
-    """Return an agreement with its probability over the share that its model is allotted."""
-    share = SHARE_OF_PLAIN if free == 0 else (1.0 - SHARE_OF_PLAIN) / (len(MODELS) - 1)
-    return replace(agreement, chance=min(1.0, agreement.chance / share))
 
 
 def _is_plain(agreement: Agreement, observation: Observation, certain: float) -> bool:
@@ -403,6 +400,11 @@ class _Fit:
     matched: Rows  # centroids with a star
     square_px: Array
 
+    @property
+    def within(self) -> Rows:
+        """Rows of ``near`` of the stars in the frame."""
+        return np.flatnonzero(np.isfinite(self.predicted_px[:, 0]))
+
 
 def _refine(
     pose: Pose,
@@ -448,16 +450,39 @@ def _refine(
     return _Fit(pose, near, u, compatible, predicted, star, matched, square_px)
 
 
-def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agreement:
-    pose, matched, star = refined.pose, refined.matched, refined.star[refined.matched]
+def _agreement_of(refined: _Fit, observation: Observation, free: int, certain: float) -> Agreement:
+    """Return the agreement of a fit with the first ``free`` terms of a shape.
+
+    The bound counts every choice of stars: until it is certain, the farthest star is left out
+    while that lowers it.
+    """
+    pose, matched, square_px = refined.pose, refined.matched, refined.square_px
+    log_chance = _log_chance(refined, matched, observation, free)
+    while math.log(certain) < log_chance < 0.0:
+        nearer = np.delete(matched, square_px[matched].argmax())
+        log_chance_of_nearer = _log_chance(refined, nearer, observation, free)
+        if not log_chance_of_nearer < log_chance:
+            break
+        matched, log_chance = nearer, log_chance_of_nearer
     index = np.empty(len(observation), dtype=np.int32)
     index.fill(-1)
-    index[matched] = refined.near[star]
+    index[matched] = refined.near[refined.star[matched]]
+    if len(matched) < MIN_STARS:
+        return Agreement(pose, index, math.nan, 0.0)
+    residual_rad = _residual_rad(pose, matched, refined.icrs[refined.star[matched]])
+    share = len(matched) / max(1, min(len(refined.within), len(observation)))
+    square_px2 = math.fsum(square_px[matched].tolist())
+    return Agreement(pose, index, residual_rad, log_chance, min(1.0, share), square_px2=square_px2)
+
+
+def _log_chance(refined: _Fit, matched: Rows, observation: Observation, free: int) -> float:
+    """Return the logarithm of the bound of the centroids of a fit that match, or of some.
+
+    It is over the share of the probability that the model has.
+    """
     if len(matched) < MIN_STARS or 2 * len(matched) <= 3 + free:
-        return Agreement(pose, index, math.nan, 1.0)
-    residual_rad = _residual_rad(pose, matched, refined.icrs[star])
-    within = np.flatnonzero(np.isfinite(refined.predicted_px[:, 0]))
-    square_px2 = math.fsum(refined.square_px[matched].tolist())
+        return 0.0
+    pose, within = refined.pose, refined.within
     px = observation.centroids_px[matched]
     unknowns = free or int(observation.fov_error > 0.0)
     half, terms = observation.half_ranges[:unknowns].copy(), pose.shape.terms
@@ -468,8 +493,8 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
             # The wider the range is, the smaller is its share of the probability.
             half[0] *= WIDER_RANGE
             growth += math.log(WIDER_RANGE)
-    chance = false_match_probability(
-        square_px2,
+    log_bound = log_false_match_probability(
+        math.fsum(refined.square_px[matched].tolist()),
         derivatives(px, pose.body[matched], pose.camera, unknowns),
         len(observation),
         len(within),
@@ -480,8 +505,8 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
         log_growth=growth,
         log_attitudes=observation.log_attitudes,
     )
-    fraction = len(matched) / max(1, min(len(within), len(observation)))
-    return Agreement(pose, index, residual_rad, chance, min(1.0, fraction), square_px2=square_px2)
+    share = SHARE_OF_PLAIN if free == 0 else (1.0 - SHARE_OF_PLAIN) / (len(MODELS) - 1)
+    return min(0.0, log_bound - math.log(share))
 
 
 def _mutually_nearest(

@@ -23,7 +23,11 @@ from starcat.geometry import attitude
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
-from starcat.matcher.chance import false_match_probability, largest_squares_px, place_information
+from starcat.matcher.chance import (
+    largest_squares_px,
+    log_false_match_probability,
+    place_information,
+)
 from starcat.matcher.shape import derivatives
 from starcat.matcher.stars import ARCSEC
 from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame
@@ -62,8 +66,8 @@ def test_the_largest_residual_is_the_one_that_the_bound_permits():
     determinant = np.array([np.linalg.det(gram)])
     (square,) = largest_squares_px(6, 8, 15, determinant, camera, 0.5, 1e-9)
     rows = derivatives(px, body, camera, 0)
-    chance = false_match_probability(float(square), rows, 8, 15, camera, noise_px=0.5)
-    assert chance == pytest.approx(1e-9, rel=1e-6)
+    log_chance = log_false_match_probability(float(square), rows, 8, 15, camera, noise_px=0.5)
+    assert log_chance == pytest.approx(np.log(1e-9), abs=1e-6)
 
 
 def test_simulated_frames_are_identified_as_often_and_as_well_as_planned(small_database):

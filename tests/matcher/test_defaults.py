@@ -57,7 +57,7 @@ def c_number(path: str, pattern: str) -> float:
 
 
 def test_flight_software_has_the_settings():
-    log_certain = c_number("onboard/src/frame.c", r"#define LOG_CERTAIN R\((\S+)\)")
+    log_certain = c_number("onboard/src/internal.h", r"#define STARCAT_LOG_CERTAIN R\((\S+)\)")
     assert math.exp(log_certain) == pytest.approx(CERTAIN, rel=1e-12)
     assert c_number("onboard/src/frame.c", r"options->tolerance_px = R\((\S+)\)") == TOLERANCE_PX
     table = "onboard/integrations/cfs/fsw/tables/starcat_app_tbl.c"

@@ -14,9 +14,9 @@ from starcat.matcher.chains import chain_of, extended
 from starcat.matcher.chance import (
     LOG_ALL_ATTITUDES,
     evidence_of_frame,
-    false_match_probability,
     joint_false_match_probability,
     log_attitudes_within,
+    log_false_match_probability,
 )
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import Tracker
@@ -68,7 +68,7 @@ def test_the_joint_bound_of_one_frame_is_its_bound(sky):
     rows = np.random.default_rng(3).normal(scale=800.0, size=(6, 2, 3))
     area = math.log(sky.camera.width_px * sky.camera.height_px)
     one = evidence_of_frame(3.0, rows, 12, 15, area, LOG_ALL_ATTITUDES)
-    alone = false_match_probability(3.0, rows, 12, 15, sky.camera)
+    alone = math.exp(log_false_match_probability(3.0, rows, 12, 15, sky.camera))
     # Two and more spots can agree with an attitude that is known, not four and more.
     assert joint_false_match_probability([one]) == pytest.approx(alone * 11.0 / 9.0, rel=1e-9)
     near = evidence_of_frame(3.0, rows, 12, 15, area, log_attitudes_within(0.02))

@@ -12,7 +12,7 @@ from frames import assert_same
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.matcher import c_engine, numpy_engine
-from starcat.matcher.chance import MIN_STARS, false_match_probability, least_matches
+from starcat.matcher.chance import MIN_STARS, least_matches, log_false_match_probability
 from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import votes
@@ -246,8 +246,14 @@ def test_a_frame_with_the_least_matches_is_accepted_and_no_smaller_one():
         body = CAMERA.directions_from_pixels(px.reshape(-1, 2)).reshape(400, n, 3)
         chances[n] = np.median(
             [
-                false_match_probability(
-                    (2 * n - 3) * noise_px**2, derivatives(places, seen, CAMERA, 0), 30, 25, CAMERA
+                math.exp(
+                    log_false_match_probability(
+                        (2 * n - 3) * noise_px**2,
+                        derivatives(places, seen, CAMERA, 0),
+                        30,
+                        25,
+                        CAMERA,
+                    )
                 )
                 / (30 - MIN_STARS + 1)  # the shares of other numbers of matches
                 for places, seen in zip(px, body, strict=True)
