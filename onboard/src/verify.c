@@ -288,10 +288,10 @@ int starcat_spend_on_bound(const starcat_call *call) {
   return starcat_spend_steps(call, steps);
 }
 
-/* Take the steps of the bound of an agreement with the first `free` terms of a shape. */
-static int spend_on_model(const starcat_call *call, uint32_t free) {
-  return starcat_spend_on_bound(call) &&
-         ((free == 0u) || starcat_spend_steps(call, STEPS_OF_FACE << free));
+/* Take the steps of the same bound again, with the first `free` terms of a shape. */
+static int spend_on_less(const starcat_call *call, uint32_t free) {
+  return starcat_spend_steps(call, STEPS_OF_MATCH * (call->own->count + call->own->n_within) +
+                                       (free > 0u ? STEPS_OF_FACE << free : 0u));
 }
 
 static void withhold_agreement(starcat_agreement *found, uint32_t reason) {
@@ -333,7 +333,7 @@ static void bound_matches(const starcat_call *call, uint32_t free,
       found->n_matched = n;
       found->square_px = square_px;
       found->log_bound = log_bound;
-      if ((log_bound > call->log_certain) && spend_on_model(call, free)) {
+      if ((log_bound > call->log_certain) && spend_on_less(call, free)) {
         last = find_farthest_match(call);
         star = w->match[last];
         w->match[last] = -1;
@@ -370,7 +370,8 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
   if (matched < STARCAT_MIN_STARS) {
     return;
   }
-  if (!spend_on_model(call, free)) {
+  if (!starcat_spend_on_bound(call) ||
+      ((free > 0u) && !starcat_spend_steps(call, STEPS_OF_FACE << free))) {
     found->n_matched = 0; /* as if nothing had matched */
     return;
   }

@@ -33,7 +33,7 @@ GROUP = 64  # stars whose votes are counted together
 FEW_VOTERS = (1, 2, 3, 4, 8, 16, C)
 MOST_MODELS = 5  # more fits per try, if four matched, with shapes
 SHAPES = ("model", "shape", "faces", "determine")
-VERIFY = ("band", "star", "try", "iteration", "bound", *SHAPES)
+VERIFY = ("band", "star", "try", "iteration", "bound", "less", *SHAPES)
 VOTES = ("group",)
 IDENTIFY = (*VERIFY, "take", "part", "block_of_rows", "sides", "pair", "third", "mark", *VOTES)
 TRACK = (*VERIFY, "predict", "next", "two")
@@ -363,6 +363,7 @@ def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
             paid += (n * within + (n + within) * min(n, within)) * has_magnitudes
             bound = total(costs, "bound", **v)
             found("bound", bound, paid)
+            found("less", total(costs, "less", **v), 16 * (n + within))
             tries.append((cost + bound, steps + paid, 1))
         else:
             tries.append((cost, steps, 0))
