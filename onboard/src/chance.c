@@ -75,8 +75,7 @@ static real log_of_sum(real a, real b) {
 
 /* Logarithm of the expected number for each set of the free terms, summed: the volumes of the
  * inside, faces, edges and corners of the box of their ranges; that of the scale is so many times
- * wider. A set that moves no place has no
- * volume. Returns 0 if the matches determine no attitude. */
+ * wider. A set that moves no place has no volume. Returns 0 if the matches determine no attitude. */
 static real sum_faces(const starcat_call *call, const starcat_normal *n, real square_px,
                       uint32_t n_matched, uint32_t free, real wider) {
   real total = LOG_NOTHING;

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -238,7 +239,7 @@ def agree(
     pose: Pose,
     observation: Observation,
     database: MatcherDatabase,
-    certain: float = 1.0,
+    certain: float,
     first: tuple[float, ...] = (),
 ) -> Agreement:
     """Match the centroids of a frame with the stars that an attitude predicts."""
@@ -400,7 +401,7 @@ class _Fit:
     matched: Rows  # centroids with a star
     square_px: Array
 
-    @property
+    @cached_property
     def within(self) -> Rows:
         """Rows of ``near`` of the stars in the frame."""
         return np.flatnonzero(np.isfinite(self.predicted_px[:, 0]))

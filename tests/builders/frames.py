@@ -76,7 +76,7 @@ both_engines = pytest.mark.parametrize("engine", ["numpy", pytest.param("c", mar
 few_in_numpy = pytest.mark.parametrize(
     ("engine", "count"),
     [
-        ("numpy", 14),
+        ("numpy", 20),
         pytest.param("numpy", 40, marks=pytest.mark.slow),
         pytest.param("c", 40, marks=needs_c),
     ],

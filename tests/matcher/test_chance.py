@@ -40,19 +40,6 @@ def rays(centroids_px: list[list[float]]) -> np.ndarray:
 FOUR = rays([[100, 150], [900, 80], [500, 980], [60, 800]])
 
 
-def chance_of(
-    square_px: float,
-    body: np.ndarray,
-    n_centroids: int,
-    stars: int,
-    camera: Camera = CAMERA,
-    free: int = 0,
-    **stated,
-) -> float:
-    """Return the bound of centroids that agree, from their directions."""
-    return math.exp(log_chance_of(square_px, body, n_centroids, stars, camera, free, **stated))
-
-
 def log_chance_of(
     square_px: float,
     body: np.ndarray,
@@ -62,9 +49,14 @@ def log_chance_of(
     free: int = 0,
     **stated,
 ) -> float:
-    """Return the logarithm of this bound."""
+    """Return the logarithm of the bound of centroids that agree, from their directions."""
     rows = derivatives(camera.pixels_from_directions(body), body, camera, free)
     return log_false_match_probability(square_px, rows, n_centroids, stars, camera, **stated)
+
+
+def chance_of(*agreement, **stated) -> float:
+    """Return this bound."""
+    return math.exp(log_chance_of(*agreement, **stated))
 
 
 # --- The value
