@@ -22,3 +22,6 @@ Rows = NDArray[np.intp]
 
 Mask = NDArray[np.bool_]
 """One bool per row, shape (N,)."""
+
+Deviations = NDArray[np.int8]
+"""Differences of magnitudes in whole standard deviations, rounded down, shape (N, M)."""

@@ -83,12 +83,9 @@ struct starcat_workspace {
   int16_t before[STARCAT_MAX_CENTROIDS];
   starcat_real match_square[STARCAT_MAX_CENTROIDS];
 
-  /* Stars that each centroid can be by its magnitude; bounds of the ways to assign n of them. */
-  uint16_t compatible[STARCAT_MAX_CENTROIDS];
+  /* Logarithms of the ways to assign n centroids to stars; sums of the weights of such ways. */
   starcat_real log_ways[STARCAT_MAX_CENTROIDS + 1];
-  starcat_real sums[4][STARCAT_MAX_CENTROIDS + 1];
-  starcat_real log_largest[4];
-  uint32_t n_some[4]; /* how many of these numbers are not 0 */
+  starcat_real sums[2][STARCAT_MAX_CENTROIDS + 1];
 
   /* Votes for each star of a group, by bins of the rotation of the frame. */
   uint8_t votes[STARCAT_GROUP][STARCAT_BINS];

@@ -53,8 +53,12 @@ static uint32_t sum_new(const starcat_call *call, const real m[9], starcat_norma
   for (uint32_t i = 0; i < call->own->count; i++) {
     if ((w->best.star[i] >= 0) && (w->before[i] != 0)) {
       real offset[2];
+      const real apart =
+          call->noise_px *
+          (real)starcat_find_deviation(
+              call, i, starcat_limit_place((uint32_t)w->best.star[i], call->image->n_stars));
       (void)starcat_find_offset(call, &w->best, m, i, offset);
-      *square_px += offset[0] * offset[0] + offset[1] * offset[1];
+      *square_px += offset[0] * offset[0] + offset[1] * offset[1] + apart * apart;
       starcat_add_normal(call, i, offset[0], offset[1], R(1.0), 0, n);
       matched++;
     }
@@ -76,7 +80,7 @@ static real log_ways_of_new(starcat_call *call, uint32_t n, uint32_t *n_new) {
   call->own->count = kept;
   *n_new = kept;
   starcat_count_ways(call, n);
-  return starcat_log_ways(call, n);
+  return w->log_ways[n];
 }
 
 /* Put the spots of the frame on the sky, after those of the chain. */
@@ -145,9 +149,9 @@ int starcat_extend_chain(const starcat_image *image, const starcat_camera *camer
 
 /* Logarithm of the bound of a chain whose first frame was `frames` frames ago, at least one. Every
  * chain that ends with a frame has a share of the probability: 2^-frames, divided by the number of
- * choices of frames between. */
-real starcat_log_joint(const starcat_chain *chain, uint32_t frames) {
-  return starcat_log_ball(chain->left, chain->square_px) + chain->log_number -
+ * choices of frames between. `rate` is that of magnitudes. */
+real starcat_log_joint(const starcat_chain *chain, uint32_t frames, real rate) {
+  return starcat_log_ball(chain->left, chain->square_px, rate) + chain->log_number -
          (real)(2u * frames - 1u) * LOG_HALF;
 }
 

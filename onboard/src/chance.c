@@ -9,8 +9,7 @@
 #define LOG_NOTHING R(-1e30)
 #define LOG_SHARE_OF_PLAIN R(-0.10536051565782630)   /* of 0.9 */
 #define LOG_SHARE_OF_SHAPE R(-3.6888794541139363057) /* of 0.1 over the number of other models */
-#define NEXT_SHARE R(0.1)
-#define LOG_NEXT_SHARE R(-2.3025850929940456840)
+#define FALL_OF_SHARE R(0.2) /* power of the factor from the limit with which shares fall */
 
 /* Logarithm of the volume of the unit ball, by Gamma(k + 1/2) = (2 k)! sqrt(pi) / (4^k k!). */
 static real log_unit_ball(uint32_t dimensions) {
@@ -22,49 +21,67 @@ static real log_unit_ball(uint32_t dimensions) {
          (real)(2u * k) * R(0.69314718055994530942);
 }
 
-/* Logarithm of the volume of a ball, by the square of its radius. */
-real starcat_log_ball(uint32_t dimensions, real square) {
-  return log_unit_ball(dimensions) +
-         R(0.5) * (real)dimensions * STARCAT_LOG(starcat_larger(square, STARCAT_LEAST_SQUARE));
+/* Logarithm of the volume of a ball, by the square of its radius. With a rate, the volume times
+ * exp(-rate s) is at least that of the ball of the square less any s. */
+real starcat_log_ball(uint32_t dimensions, real square_px, real rate) {
+  const real half = R(0.5) * (real)dimensions;
+  const real square = starcat_larger(square_px, STARCAT_LEAST_SQUARE);
+  const real excess = rate * square / half;
+  real log_volume = log_unit_ball(dimensions) + half * STARCAT_LOG(square);
+  if (excess > R(1.0)) {
+    log_volume += half * (excess - R(1.0) - STARCAT_LOG(excess));
+  }
+  return log_volume;
+}
+
+/* The rate by which squared residuals of magnitudes lower the number of ways; 0 if they are none. */
+real starcat_find_rate(real noise_px, real noise_mag) {
+  return (noise_px > R(0.0)) && (noise_mag > R(0.0)) ? R(1.0) / (R(3.0) * noise_px * noise_px)
+                                                     : R(0.0);
 }
 
 /* Logarithm of the expected number of chance agreements of n centroids, by the number of unknowns
  * in the fit, and the logarithm of the root of the determinant of their squared derivatives. */
 static real log_expected(const starcat_call *call, uint32_t n, real square_px, real log_root,
                          uint32_t unknowns) {
-  return starcat_log_ways(call, n) + call->log_attitudes + log_root +
-         starcat_log_ball(2u * n - unknowns, square_px) - (real)n * call->camera.log_area;
+  const real rate = starcat_find_rate(call->noise_px, call->noise_mag);
+  return call->work->log_ways[n] + call->log_attitudes + log_root +
+         starcat_log_ball(2u * n - unknowns, square_px, rate) - (real)n * call->camera.log_area;
 }
 
 /* Logarithm of the expected number of chance agreements of n centroids whose residuals are what noise
  * makes on average, and which are spread over the whole frame, by that of all ways and attitudes. */
-static real log_typical(const starcat_call *call, uint32_t n, real log_all, real sigma_px) {
+static real log_typical(const starcat_call *call, uint32_t n, real log_all, uint32_t residuals,
+                        real sigma_px) {
   const starcat_camera *c = &call->camera.given;
-  const uint32_t left = 2u * n - 3u;
   const real square_of_frame = (c->width_px * c->width_px + c->height_px * c->height_px) / R(12.0);
   const real number = (real)n;
   return log_all + R(0.5) * STARCAT_LOG(number * number * number * square_of_frame) +
-         R(2.0) * call->camera.log_focal + starcat_log_ball(left, (real)left * sigma_px * sigma_px) -
+         R(2.0) * call->camera.log_focal +
+         starcat_log_ball(2u * n - 3u, (real)(residuals - 3u) * sigma_px * sigma_px, R(0.0)) -
          number * call->camera.log_area;
 }
 
-/* Logarithm of the share of the probability that n of `most` stars are allotted where the noise
- * is stated: most to the number whose agreements are typically just certain, a tenth of it to the
- * next one, and so on. */
-static real log_share(const starcat_call *call, uint32_t n, uint32_t most) {
-  uint32_t typical = STARCAT_MIN_STARS;
-  real total = R(0.0), share = R(1.0);
-  while ((typical < most) &&
-         (log_typical(call, typical, starcat_log_ways(call, typical) + call->log_attitudes,
-                      call->noise_px) > STARCAT_LOG_CERTAIN)) {
-    typical++;
+/* Divide the ways to assign n centroids to stars, n up to `most`, by the share of the probability that n
+ * has where the noise is stated: most have those whose agreements are typically as rare as the limit. */
+void starcat_share_ways(const starcat_call *call, uint32_t most) {
+  real *falls = call->work->sums[0], *log_ways = call->work->log_ways;
+  const uint32_t residuals = call->noise_mag > R(0.0) ? 3u : 2u; /* of a star */
+  real least = R(1e30), total = R(0.0);
+  for (uint32_t n = STARCAT_MIN_STARS; n <= most; n++) {
+    const real log_all = log_ways[n] + call->log_attitudes;
+    falls[n] = FALL_OF_SHARE *
+               starcat_absolute(log_typical(call, n, log_all, residuals * n, call->noise_px) -
+                                STARCAT_LOG_CERTAIN);
+    least = starcat_smaller(least, falls[n]);
   }
-  for (uint32_t distance = 0; distance <= most - STARCAT_MIN_STARS; distance++) {
-    total += share * (real)((uint32_t)(typical >= STARCAT_MIN_STARS + distance) +
-                            (uint32_t)((distance > 0u) && (typical + distance <= most)));
-    share *= NEXT_SHARE;
+  for (uint32_t n = STARCAT_MIN_STARS; n <= most; n++) {
+    falls[n] -= least;
+    total += falls[n] < R(60.0) ? R(1.0) / starcat_exponential(falls[n]) : R(0.0);
   }
-  return (real)(n > typical ? n - typical : typical - n) * LOG_NEXT_SHARE - STARCAT_LOG(total);
+  for (uint32_t n = STARCAT_MIN_STARS; n <= most; n++) {
+    log_ways[n] += falls[n] + STARCAT_LOG(total);
+  }
 }
 
 /* Logarithm of the sum of two numbers whose logarithms are given. */
@@ -109,7 +126,7 @@ static real sum_faces(const starcat_call *call, const starcat_normal *n, real sq
 }
 
 /* Logarithm of the bound of an agreement with the first `free` terms of a shape, over the share of
- * the probability that its model has, after starcat_count_ways; 0 if the bound excludes nothing. If
+ * the probability that its model has, after starcat_count_ways and starcat_share_ways; 0 if the bound excludes nothing. If
  * the focal length is not known, the scale is free in any case. */
 real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched, uint32_t free,
                         const real terms[STARCAT_SHAPE_TERMS]) {
@@ -128,8 +145,9 @@ real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_mat
   }
   starcat_sum_normal(call, unknowns, &n);
   real expected = sum_faces(call, &n, square_px, n_matched, unknowns, wider) + growth;
-  expected -= call->noise_px > R(0.0) ? log_share(call, n_matched, starcat_count_fewer(call))
-                                      : -STARCAT_LOG((real)(call->own->count - 3u));
+  if (!(call->noise_px > R(0.0))) {
+    expected += STARCAT_LOG((real)(call->own->count - 3u));
+  }
   expected -= free == 0u ? LOG_SHARE_OF_PLAIN : LOG_SHARE_OF_SHAPE;
   return expected < R(0.0) ? expected : R(0.0);
 }
@@ -142,7 +160,7 @@ uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, re
   real log_all = STARCAT_LOG_ALL_ATTITUDES;
   for (uint32_t n = 1; n < most; n++) {
     log_all += STARCAT_LOG((real)(count - n + 1u) * (real)(stars - n + 1u) / (real)n);
-    if ((n >= STARCAT_MIN_STARS) && (log_typical(call, n, log_all, sigma_px) <= call->log_limit)) {
+    if ((n >= STARCAT_MIN_STARS) && (log_typical(call, n, log_all, 2u * n, sigma_px) <= call->log_limit)) {
       return n;
     }
   }

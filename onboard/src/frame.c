@@ -147,8 +147,7 @@ static void set_limits(starcat_call *call, const starcat_options *options) {
   starcat_set_ranges(call, options->camera_error);
   call->tolerance_rad = call->tolerance_px / call->camera.given.focal_length_px;
   call->reach_px = STARCAT_REACH * call->tolerance_px;
-  call->mag_reach =
-      call->own->has_magnitudes != 0u ? STARCAT_MAG_DEVIATIONS * options->noise_mag : R(0.0);
+  call->noise_mag = call->own->has_magnitudes != 0u ? options->noise_mag : R(0.0);
   call->log_limit = options->log_chance;
   /* A higher limit accepts more, but ends no search earlier. */
   call->log_certain = starcat_smaller(options->log_chance, STARCAT_LOG_CERTAIN);

@@ -45,6 +45,7 @@
 #define STARCAT_SIGMAS_OF_TOLERANCE R(3.0)
 #define STARCAT_NOTABLE_DEVIATIONS R(3.0) /* of chi-square, beyond which chance does not count */
 #define STARCAT_MAG_DEVIATIONS R(3.5)
+#define STARCAT_INCOMPATIBLE 4u /* whole deviations of magnitudes that differ by more */
 #define STARCAT_MIN_SIDE_PX R(10.0)
 #define STARCAT_COS_MIN_ANGLE R(0.96592582628906828675)   /* 15 degrees */
 #define STARCAT_COS_LEAST_ANGLE R(0.99756405025982424761) /* 4 degrees */
@@ -118,7 +119,7 @@ typedef struct {
   real tolerance_px, tolerance_rad, reach_px;
   real noise_px;       /* standard deviation of a centroid on each axis; 0: not stated */
   real columns_per_px; /* columns of the detector that list its centroids */
-  real mag_reach;      /* largest difference of magnitudes of a match; 0: any */
+  real noise_mag;      /* standard deviation of magnitudes; 0: not stated, or no magnitudes */
   real log_limit;      /* largest accepted chance */
   real log_certain;
   const real *sigma_px; /* noise of the frame's centroids; null: not stated */
@@ -236,12 +237,13 @@ uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], re
 
 /* ways.c */
 void starcat_count_ways(const starcat_call *call, uint32_t most);
-real starcat_log_ways(const starcat_call *call, uint32_t n);
 
 /* chance.c */
 real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched, uint32_t free,
                         const real terms[STARCAT_SHAPE_TERMS]);
-real starcat_log_ball(uint32_t dimensions, real square);
+void starcat_share_ways(const starcat_call *call, uint32_t most);
+real starcat_log_ball(uint32_t dimensions, real square_px, real rate);
+real starcat_find_rate(real noise_px, real noise_mag);
 uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, real sigma_px);
 
 /* shape.c */
@@ -264,6 +266,7 @@ real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx
                             real weight, starcat_step *step);
 
 /* verify.c */
+uint32_t starcat_find_deviation(const starcat_call *call, uint32_t centroid, uint32_t row);
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
 uint32_t starcat_count_fewer(const starcat_call *call);
 int starcat_spend_on_bound(const starcat_call *call);
@@ -308,7 +311,7 @@ int starcat_extend_chain(const starcat_image *image, const starcat_camera *camer
                          const starcat_options *options, const starcat_frame *frame,
                          starcat_workspace *work, const starcat_result *candidate, real error_rad,
                          real (*spots)[3], starcat_chain *chain, uint32_t *steps);
-real starcat_log_joint(const starcat_chain *chain, uint32_t frames);
+real starcat_log_joint(const starcat_chain *chain, uint32_t frames, real rate);
 void starcat_confirm_candidate(const starcat_workspace *work, uint32_t count, real log_joint,
                                starcat_result *result);
 

@@ -311,7 +311,8 @@ static starcat_status confirm_frame(starcat_session *s, const starcat_frame *fra
     is_linked = extend_chain(s, &moved, settings->prior_error_rad, most, answer, &linked);
   }
   if (is_linked != 0) {
-    const real log_joint = starcat_log_joint(&linked, s->n_frames - linked.first);
+    const real rate = starcat_find_rate(settings->options.noise_px, settings->options.noise_mag);
+    const real log_joint = starcat_log_joint(&linked, s->n_frames - linked.first, rate);
     if (log_joint <= settings->options.log_chance) {
       starcat_confirm_candidate(&s->workspace, frame->count, log_joint, &answer->result);
       answer->mode = STARCAT_MODE_CONFIRM;

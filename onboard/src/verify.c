@@ -31,16 +31,25 @@
 #define DOUBLED_FOR_SHAPE 2u   /* the same to fit a shape */
 #define FREE_TERMS 4u          /* with which the stars of an answer must determine the boresight */
 
-/* Whether the magnitudes of a centroid and a star are compatible. */
-int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
+/* By how many whole deviations the magnitudes of a centroid and a star differ. Without a stated noise
+ * of places, which is their unit, it is 0, or STARCAT_INCOMPATIBLE. */
+uint32_t starcat_find_deviation(const starcat_call *call, uint32_t centroid, uint32_t row) {
   const real observed = call->work->magnitude[centroid];
   const int16_t stored = call->image->magnitudes[starcat_limit_place(row, call->image->n_stars)];
-  if (!(call->mag_reach > R(0.0)) || (stored == INT16_MIN) ||
+  if (!(call->noise_mag > R(0.0)) || (stored == INT16_MIN) ||
       !(observed < STARCAT_UNKNOWN_MAGNITUDE)) {
-    return 1;
+    return 0;
   }
-  const real apart = observed - R(0.001) * (real)stored;
-  return starcat_absolute(apart) <= call->mag_reach;
+  const real apart = starcat_absolute(observed - R(0.001) * (real)stored);
+  if (!(apart <= STARCAT_MAG_DEVIATIONS * call->noise_mag)) {
+    return STARCAT_INCOMPATIBLE;
+  }
+  return call->noise_px > R(0.0) ? (uint32_t)(apart / call->noise_mag) : 0u;
+}
+
+/* Whether the magnitudes of a centroid and a star are compatible. */
+int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
+  return starcat_find_deviation(call, centroid, row) < STARCAT_INCOMPATIBLE;
 }
 
 /* Project the stars around the field on the detector; keep stars within a margin of it. */
@@ -74,8 +83,13 @@ static void match_star(const starcat_call *call, uint32_t k, real reach_px, real
        (n < stop) && (n < STARCAT_MAX_CENTROIDS); n++) {
     const uint32_t i = starcat_limit_place(w->in_column[n], STARCAT_MAX_CENTROIDS);
     const real dx = call->x[i] - x, dy = call->y[i] - y;
-    const real square = dx * dx + dy * dy;
-    if ((square <= reach) && starcat_is_compatible(call, i, w->near_row[starcat_find_near(w, k)])) {
+    real square = dx * dx + dy * dy;
+    const uint32_t deviation =
+        square <= reach ? starcat_find_deviation(call, i, w->near_row[starcat_find_near(w, k)])
+                        : STARCAT_INCOMPATIBLE;
+    if (deviation < STARCAT_INCOMPATIBLE) {
+      const real apart = call->noise_px * (real)deviation;
+      square += apart * apart;
       if ((w->match[i] < 0) || (square < w->match_square[i])) {
         w->match_square[i] = square;
         w->match[i] = (int16_t)k;
@@ -277,13 +291,12 @@ uint32_t starcat_count_fewer(const starcat_call *call) {
 }
 
 /* Take the steps of the bound of an agreement. Magnitudes cost most: every centroid is compared
- * with every star, and polynomials of both are summed. Returns 0 if the budget is used up. */
+ * with every star, and a polynomial is summed. Returns 0 if the budget is used up. */
 int starcat_spend_on_bound(const starcat_call *call) {
   const uint32_t most = starcat_count_fewer(call);
   uint32_t steps = STEPS_OF_MATCH * (call->own->count + call->own->n_within);
-  if (call->mag_reach > R(0.0)) {
-    steps +=
-        call->own->count * call->own->n_within + (call->own->count + call->own->n_within) * most;
+  if (call->noise_mag > R(0.0)) {
+    steps += call->own->count * call->own->n_within + most * most;
   }
   return starcat_spend_steps(call, steps);
 }
@@ -299,7 +312,7 @@ static void withhold_agreement(starcat_agreement *found, uint32_t reason) {
   found->log_chance = R(0.0);
 }
 
-/* The match that is farthest from its star. */
+/* The match with the largest residual. */
 static uint32_t find_farthest_match(const starcat_call *call) {
   const starcat_workspace *w = call->work;
   real most = R(-1.0);
@@ -322,7 +335,12 @@ static void bound_matches(const starcat_call *call, uint32_t free,
   int16_t star = w->match[last];
   int goes_on = 1;
   real square_px = R(0.0);
-  starcat_count_ways(call, call->noise_px > R(0.0) ? starcat_count_fewer(call) : n);
+  if (call->noise_px > R(0.0)) {
+    starcat_count_ways(call, starcat_count_fewer(call));
+    starcat_share_ways(call, starcat_count_fewer(call));
+  } else {
+    starcat_count_ways(call, n);
+  }
   for (uint32_t i = 0; i < call->own->count; i++) {
     square_px += w->match[i] >= 0 ? w->match_square[i] : R(0.0);
   }
@@ -331,7 +349,6 @@ static void bound_matches(const starcat_call *call, uint32_t free,
     goes_on = 0;
     if (log_bound < found->log_bound) {
       found->n_matched = n;
-      found->square_px = square_px;
       found->log_bound = log_bound;
       if ((log_bound > call->log_certain) && spend_on_less(call, free)) {
         last = find_farthest_match(call);
@@ -380,8 +397,11 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
     found->star[i] = STARCAT_NO_STAR;
     if (w->match[i] >= 0) {
       const uint32_t j = starcat_find_near(w, starcat_find_match(w, i));
+      const real dx = call->x[i] - w->x_of[starcat_find_match(w, i)];
+      const real dy = call->y[i] - w->y_of[starcat_find_match(w, i)];
       real body[3];
       starcat_turn(m, w->near_icrs[j], body);
+      found->square_px += dx * dx + dy * dy;
       square_rad += starcat_chord_square(call->body[i], body);
       found->star[i] = (int32_t)w->near_row[j];
     }

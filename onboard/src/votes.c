@@ -285,9 +285,10 @@ static void list_voters(const starcat_call *call, uint32_t reference, surroundin
       v->sine = STARCAT_SIN(own);
       v->brightest = 0;
       v->range = UNKNOWN - 1u;
-      if ((call->mag_reach > R(0.0)) && (w->magnitude[i] < STARCAT_UNKNOWN_MAGNITUDE)) {
-        v->brightest = (uint8_t)find_magnitude(w->magnitude[i] - call->mag_reach);
-        v->range = (uint8_t)(find_magnitude(w->magnitude[i] + call->mag_reach) - v->brightest);
+      if ((call->noise_mag > R(0.0)) && (w->magnitude[i] < STARCAT_UNKNOWN_MAGNITUDE)) {
+        const real reach = STARCAT_MAG_DEVIATIONS * call->noise_mag;
+        v->brightest = (uint8_t)find_magnitude(w->magnitude[i] - reach);
+        v->range = (uint8_t)(find_magnitude(w->magnitude[i] + reach) - v->brightest);
       }
       s->count += (uint32_t)(s->count < STARCAT_MAX_VOTERS);
     }

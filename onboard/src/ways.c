@@ -1,133 +1,98 @@
-/* The number of ways to assign centroids to stars, which stated magnitudes reduce. The same bounds
- * as in the ground's starcat/matcher/chance.py, which derives them.
+/* The number of ways to assign centroids to stars, which stated magnitudes reduce. The same bound
+ * as in the ground's starcat/matcher/chance.py, which derives it.
  *
  * SPDX-License-Identifier: MIT
  */
 #include "internal.h"
 
-#define LEAST R(-1e30) /* logarithm of zero ways */
-#define SMALL 16u
-/* Largest count of numbers up to 1 whose polynomials cannot overflow: they are below exp(count). */
+#define NO_WAYS R(-1e30) /* logarithm of zero ways */
+/* Polynomials of numbers up to 1 are below exp(count of the numbers), which must not overflow. */
 #ifdef STARCAT_SINGLE
 #define MOST_OF_SUM 80u
 #else
 #define MOST_OF_SUM 700u
 #endif
-#define FAR_MAGNITUDE R(1e30) /* for stars of unknown magnitude, which are counted separately */
+#define UNIT (1u + (STARCAT_MAX_CENTROIDS - 1u) / MOST_OF_SUM)
 
-/* Compute the elementary symmetric polynomials of `count` numbers up to degree `most`, in units of
- * the largest one, or of a multiple. From the third bound on the numbers n stand for (n!)^(1/n). */
-static void sum_polynomials(starcat_workspace *w, uint32_t bound, const uint16_t *numbers,
-                            uint32_t count, uint32_t most) {
-  const int is_tight = bound >= 2u;
-  real *sums = w->sums[bound];
-  uint32_t unit = 1;
-  uint32_t top = 1;
-  real shares[SMALL] = {0};
-  for (uint32_t i = 0; i < count; i++) {
-    top = numbers[i] > top ? numbers[i] : top;
-  }
-  while (count / unit > MOST_OF_SUM) { /* too many numbers: the sums would overflow */
-    unit *= 2u;
-  }
-  const real largest =
-      (real)unit *
-      (is_tight ? starcat_exponential(starcat_log_factorial(top) / (real)top) : (real)top);
-  w->log_largest[bound] = STARCAT_LOG(largest);
-  w->n_some[bound] = 0;
-  sums[0] = R(1.0);
-  for (uint32_t k = 1; k <= most; k++) {
-    sums[k] = R(0.0);
-  }
-  for (uint32_t i = 0; i < count; i++) {
-    const uint32_t own = numbers[i], place = own < SMALL ? own : 0u;
-    if (own == 0u) {
-      continue;
-    }
-    w->n_some[bound]++;
-    real share = shares[place];
-    if ((place == 0u) || !(share > R(0.0))) { /* else it was computed before: many are equal */
-      share = (is_tight ? starcat_exponential(starcat_log_factorial(own) / (real)own) : (real)own) /
-              largest;
-      shares[place] = share;
-    }
-    for (uint32_t k = i < most ? i + 1u : most; k > 0u; k--) { /* all beyond are 0 */
-      sums[k] += share * sums[k - 1u];
-    }
-  }
+/* Logarithm of a sum of products of n numbers in a unit. */
+static real log_scaled(real sum, uint32_t n, real unit) {
+  return STARCAT_LOG(starcat_larger(sum, STARCAT_LEAST_NUMBER)) + (real)n * STARCAT_LOG(unit);
 }
 
-/* Term that Bregman's theorem adds to the logarithm for n, with `others` on the other side. */
-static real log_filled(uint32_t others, uint32_t n) {
-  return (real)(others - n) / (real)others * starcat_log_factorial(others) -
-         starcat_log_factorial(others - n);
+/* (n!)^(1/n); 0 for 0. */
+static real root_of_factorial(uint32_t n) {
+  return n > 0u ? starcat_exponential(starcat_log_factorial(n) / (real)n) : R(0.0);
 }
 
-/* Logarithm of the bound of the ways to assign n of the centroids to n stars, after
- * starcat_count_ways. */
-real starcat_log_ways(const starcat_call *call, uint32_t n) {
+/* The sums of the weights exp(-d^2 / 3) of the partners that a centroid or a star can have, d whole
+ * deviations apart: as they are, and in the terms of Bregman's theorem, of those that are d apart at
+ * most, times what the weight falls from d to d + 1. */
+static void weigh_partners(const starcat_call *call, uint32_t one, int is_star, uint32_t partners,
+                           real sums[2]) {
+  static const real FALL[STARCAT_INCOMPATIBLE] = {R(0.28346868942621073), R(0.45293417245806250),
+                                                  R(0.21381006974786282), R(0.049787068367863943)};
   const starcat_workspace *w = call->work;
-  real least = w->log_ways[n];
-  for (uint32_t bound = 0; (bound < 4u) && (call->mag_reach > R(0.0)); bound++) {
-    real logarithm = LEAST;
-    if (n <= w->n_some[bound]) { /* else there is no way; the sum of a way can round to 0 */
-      logarithm = STARCAT_LOG(starcat_larger(w->sums[bound][n], STARCAT_LEAST_NUMBER)) +
-                  (real)n * w->log_largest[bound];
-      if (bound >= 2u) {
-        logarithm += log_filled(bound == 2u ? call->own->n_within : call->own->count, n);
-      }
-    }
-    least = logarithm < least ? logarithm : least;
+  uint32_t number[STARCAT_INCOMPATIBLE + 1u] = {0}, count = 0;
+  for (uint32_t k = 0; k < partners; k++) {
+    const uint32_t star = w->near_row[starcat_find_near(w, is_star != 0 ? one : k)];
+    number[starcat_find_deviation(call, is_star != 0 ? k : one, star)]++;
   }
-  return least;
+  sums[0] = R(0.0);
+  sums[1] = R(0.0);
+  for (uint32_t d = 0; d < STARCAT_INCOMPATIBLE; d++) {
+    count += number[d];
+    sums[0] += FALL[d] * (real)count;
+    sums[1] += FALL[d] * root_of_factorial(count);
+  }
 }
 
-/* Count the stars that each centroid can be, and the centroids that each star can be. `nearest` and
- * `nearest_square` are no longer needed at this point and are used as memory. */
-static void count_compatible(const starcat_call *call) {
+/* Find the logarithms of the sums of the weights of the ways to assign 1 to `most` centroids to
+ * stars: the less of two bounds. Centroids or stars, whichever are fewer, are the numbers of elementary
+ * symmetric polynomials, in units of the largest possible number, or of a multiple. */
+static void weigh_ways(const starcat_call *call, uint32_t most) {
   starcat_workspace *w = call->work;
-  const real reach = call->mag_reach;
-  uint16_t unknown = 0;
-  for (uint32_t j = 0; j < call->own->n_within; j++) {
-    const int16_t stored = call->image->magnitudes[starcat_limit_place(
-        w->near_row[starcat_find_near(w, j)], call->image->n_stars)];
-    const int is_known = stored != INT16_MIN;
-    w->nearest_square[j] = is_known ? R(0.001) * (real)stored : FAR_MAGNITUDE;
-    w->nearest[j] = is_known ? 0u : (uint16_t)call->own->count;
-    unknown = (uint16_t)(unknown + (is_known ? 0u : 1u));
+  const uint32_t centroids = call->own->count, stars = call->own->n_within;
+  const int is_star = stars < centroids;
+  const uint32_t fewer = is_star != 0 ? stars : centroids;
+  const uint32_t others = is_star != 0 ? centroids : stars;
+  const real log_all = starcat_log_factorial(others);
+  const real unit[2] = {(real)UNIT * (real)others, (real)UNIT * root_of_factorial(others)};
+  uint32_t some = 0;
+  for (uint32_t n = 0; n <= most; n++) {
+    w->sums[0][n] = n > 0u ? R(0.0) : R(1.0);
+    w->sums[1][n] = w->sums[0][n];
   }
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    const real observed = w->magnitude[i];
-    const int is_known = observed < STARCAT_UNKNOWN_MAGNITUDE;
-    uint16_t some = unknown;
-    for (uint32_t j = 0; j < call->own->n_within; j++) {
-      const real apart = observed - w->nearest_square[j];
-      const uint16_t fits = (uint16_t)((apart <= reach) & (-apart <= reach));
-      some = (uint16_t)(some + fits);
-      w->nearest[j] = (uint16_t)(w->nearest[j] + fits);
+  for (uint32_t i = 0; i < fewer; i++) {
+    real sums[2];
+    weigh_partners(call, i, is_star, others, sums);
+    some += sums[0] > R(0.0) ? 1u : 0u;
+    for (uint32_t n = i < most ? i + 1u : most; n > 0u; n--) { /* all beyond are 0 */
+      w->sums[0][n] += sums[0] / unit[0] * w->sums[0][n - 1u];
+      w->sums[1][n] += sums[1] / unit[1] * w->sums[1][n - 1u];
     }
-    for (uint32_t j = 0; !is_known && (j < call->own->n_within); j++) {
-      w->nearest[j] = (uint16_t)(w->nearest[j] + (w->nearest_square[j] < FAR_MAGNITUDE ? 1u : 0u));
-    }
-    w->compatible[i] = is_known ? some : (uint16_t)call->own->n_within;
+  }
+  for (uint32_t n = 1; n <= most; n++) { /* the sum of a way can round to 0 */
+    const real filled = (real)(others - n) / (real)others * log_all - starcat_log_factorial(others - n);
+    w->log_ways[n] =
+        n > some
+            ? NO_WAYS
+            : starcat_smaller(log_scaled(w->sums[0][n], n, unit[0]),
+                              log_scaled(w->sums[1][n], n, unit[1]) + filled);
   }
 }
 
-/* Prepare starcat_log_ways for every n up to `most`: the number of all ways and, with magnitudes,
- * four bounds of the ways with similar magnitudes, from the centroids and from the stars. */
+/* Find the logarithms of the numbers of ways to assign 1 to `most` centroids to stars; with magnitudes
+ * bounds of the sums of their weights. */
 void starcat_count_ways(const starcat_call *call, uint32_t most) {
   starcat_workspace *w = call->work;
-  const uint32_t stars = call->own->n_within;
   w->log_ways[0] = R(0.0);
-  for (uint32_t n = 1; n <= most; n++) {
-    w->log_ways[n] = w->log_ways[n - 1u] + STARCAT_LOG((real)(call->own->count - n + 1u) *
-                                                       (real)(stars - n + 1u) / (real)n);
+  if (call->noise_mag > R(0.0)) {
+    weigh_ways(call, most);
+    return;
   }
-  if (call->mag_reach > R(0.0)) {
-    count_compatible(call);
-    sum_polynomials(w, 0, w->compatible, call->own->count, most);
-    sum_polynomials(w, 1, w->nearest, stars, most);
-    sum_polynomials(w, 2, w->compatible, call->own->count, most);
-    sum_polynomials(w, 3, w->nearest, stars, most);
+  for (uint32_t n = 1; n <= most; n++) {
+    w->log_ways[n] =
+        w->log_ways[n - 1u] + STARCAT_LOG((real)(call->own->count - n + 1u) *
+                                          (real)(call->own->n_within - n + 1u) / (real)n);
   }
 }

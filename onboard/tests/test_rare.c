@@ -2,6 +2,7 @@
  *
  * SPDX-License-Identifier: MIT
  */
+#include <math.h>
 #include <string.h>
 
 #include "internal.h"
@@ -371,30 +372,80 @@ static void check_noises(void) {
   CHECK(identified[3] < identified[0]);
 }
 
-/* Number of ways to assign centroids that no star resembles: 0. If all are alike, Bregman's bounds
- * equal the number of all ways. */
+/* Logarithm of the ways to assign n centroids to stars, without magnitudes or with a noise of them. */
+static double log_ways(uint32_t n, double noise_mag) {
+  call.noise_mag = (starcat_real)noise_mag;
+  starcat_count_ways(&call, n);
+  return (double)unit_work.log_ways[n];
+}
+
+/* Give centroids magnitudes that are so many times the noise of 0.01 off, or of all in turn from the first
+ * centroid on, from the magnitude of all stars. Returns the logarithm of the sum of the weights of the
+ * ways to assign all centroids to stars. */
+static double log_apart(double first, double others) {
+  for (uint32_t i = 0; i < call.own->count; i++) {
+    unit_work.magnitude[i] = (starcat_real)(5.0 + 0.01 * (i == 0u ? first : others));
+  }
+  return log_ways(call.own->count, 0.01);
+}
+
+/* If all centroids and stars are alike, the bound of the ways is their number, whether centroids or stars
+ * are fewer. */
 static void check_ways(void) {
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
   CHECK(starcat_try_attitude(&call, unit_result.matrix, (starcat_real)1.0));
-  call.mag_reach = (starcat_real)100.0;
-  starcat_count_ways(&call, 5);
-  const double all = (double)unit_work.log_ways[5];
-  CHECK_NEAR((double)starcat_log_ways(&call, 5), all, 1e-4);
-  /* Of more stars than single precision adds up in units of the largest number. */
-  const uint32_t stars = call.own->n_within;
+  CHECK_NEAR(log_ways(5, 100.0), log_ways(5, 0.0), 1e-4);
+  /* Of many stars. */
+  const uint32_t stars = call.own->n_within, count = call.own->count;
   for (uint32_t j = stars; j < 180u; j++) {
     unit_work.within[j] = unit_work.within[j - stars];
   }
   call.own->n_within = 180;
-  starcat_count_ways(&call, SKY_SPOTS);
-  CHECK_NEAR((double)starcat_log_ways(&call, SKY_SPOTS), (double)unit_work.log_ways[SKY_SPOTS],
-             1e-3);
+  CHECK_NEAR(log_ways(count, 100.0), log_ways(count, 0.0), 1e-3);
+  call.own->n_within = 5; /* of few */
+  CHECK_NEAR(log_ways(5, 100.0), log_ways(5, 0.0), 1e-4);
   call.own->n_within = stars;
-  for (uint32_t i = 0; i < call.own->count; i++) {
-    unit_work.magnitude[i] = (starcat_real)1000.0;
+}
+
+/* With a rate of magnitudes a ball is above the volumes that their squares leave for the places, and is
+ * the ball itself where its square is not above the typical one. */
+static void check_ball(void) {
+  for (uint32_t n = 1; n < 40u; n++) {
+    const double square = 0.5 * n, rate = 1.0 / 3.0, half = 2.5;
+    const double volume = (double)starcat_log_ball(5, (starcat_real)square, 0);
+    const double bound = (double)starcat_log_ball(5, (starcat_real)square, (starcat_real)rate);
+    double most = volume;
+    for (double s = 0.0; s < square; s += 0.01) {
+      const double left = volume + half * log1p(-s / square) + rate * s;
+      most = left > most ? left : most;
+    }
+    CHECK_NEAR(bound, most, 1e-4);
   }
-  starcat_count_ways(&call, 5);
-  CHECK(starcat_log_ways(&call, 5) < (starcat_real)-1e29);
+}
+
+/* A way counts by how many whole deviations its magnitudes are apart, if the noise of places is stated.
+ * Centroids that no star resembles have none. */
+static void check_weights(void) {
+  unit_sky *sky = &unit_scratch;
+  static int16_t magnitude[4096];
+  unit_copy(&unit_triangle);
+  CHECK(sky->image.n_stars <= 4096u);
+  for (uint32_t j = 0; j < 4096u; j++) {
+    magnitude[j] = 5000;
+  }
+  sky->image.magnitudes = magnitude;
+  sky->options.noise_px = (starcat_real)0.2;
+  begin(sky, 4, SKY_SPOTS, 0);
+  CHECK(starcat_try_attitude(&call, unit_result.matrix, (starcat_real)1.0));
+  const double none = log_apart(0.5, 0.5), count = (double)call.own->count;
+  for (uint32_t d = 1; d < STARCAT_INCOMPATIBLE; d++) {
+    const double apart = (double)d + 0.25;
+    CHECK_NEAR(log_apart(apart, apart), none - count * d * d / 3.0, 1e-3);
+    CHECK_NEAR(log_apart(-apart, 0.0), none - d * d / 3.0, 1e-3);
+  }
+  CHECK(log_apart(0.5, 4.0) < -1e29);
+  call.noise_px = (starcat_real)0.0;
+  CHECK_NEAR(log_apart(3.25, -1.25), none, 1e-3);
 }
 
 /* A prior that reaches beyond the fold of the lens, where nothing is visible; and a prior so wide
@@ -594,6 +645,8 @@ void test_rare(void) {
   check_wide();
   check_noises();
   check_ways();
+  check_ball();
+  check_weights();
   check_priors();
   check_caps();
   check_focal_length();

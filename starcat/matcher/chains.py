@@ -23,6 +23,7 @@ from starcat.matcher.chance import (
     FrameEvidence,
     evidence_of_frame,
     joint_false_match_probability,
+    rate_of_magnitudes,
 )
 from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.observation import observe
@@ -116,17 +117,22 @@ def _linked(
     near = stars_in_cap(database, matrix[2], camera.radius_rad)
     star_px = camera.pixels_from_directions(database.directions[near] @ matrix.T)
     near = near[is_near_frame(star_px, camera, REACH * seen.tolerance_px)]
-    compatible = seen.compatible(database.mag[near])
+    deviations = seen.deviations(database.mag[near])
     u = database.directions[star[matched]]
     residual = seen.centroids_px[matched] - camera.pixels_from_directions(u @ matrix.T)
+    square_px = float(np.vdot(residual, residual))
+    of_stars = seen.deviations(database.mag[star[matched]])
+    if of_stars is not None:
+        square_px += seen.noise_px**2 * float(np.square(of_stars[matched].diagonal()).sum())
     evidence = evidence_of_frame(
-        float(np.vdot(residual, residual)),
+        square_px,
         derivatives(seen.centroids_px[matched], seen.body[matched], camera, 0),
         int(is_new.sum()),
         len(near),
         log_area,
         log_attitudes,
-        None if compatible is None else compatible[is_new],
+        0.0 if settings.noise_mag is None else rate_of_magnitudes(settings.noise_px),
+        None if deviations is None else deviations[is_new],
     )
     if evidence is None:
         return None

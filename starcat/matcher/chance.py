@@ -27,18 +27,26 @@ areas around the places before the shape was undone are larger or smaller (`log_
 camera has the corner alone, a focal length that is known to some per cent has one edge.
 
 Magnitudes. Assignments of centroids to stars that they are not compatible with are never
-agreements, so they are not counted (`log_compatible_assignments`). The hypothesis is that the
-places of the centroids are random; it makes no assumption about their magnitudes. So the
-expected number is the number for random places with the magnitudes of the frame, whatever they
-are. It also holds if false spots have the same magnitudes as stars, and if the stated error is
-wrong (then true frames can be missed).
+agreements, so they are not counted. If the noise of the centroids is stated too, a magnitude is a
+residual as a place is: the square of its difference, in whole standard deviations, is added to Q in
+units of the noise of a place. An assignment whose magnitudes differ by s in all leaves a ball of
+the squared radius Q - s for the places. With half of its dimensions k, and the typical rate of 1/3
+(k = n - 3/2, and Q has 3n - 3 dimensions), its volume is at most ``Q^k exp(-s / 3)``, times a term
+that is above 1 only for larger Q than the typical one (`_log_ball`). So each pair of a centroid and
+a star counts ``exp(-d^2 / 3)``, with d their difference (`log_weighted_assignments`).
+
+The hypothesis is that the places of the centroids are random; it makes no assumption about their
+magnitudes. So the expected number is the number for random places with the magnitudes of the frame,
+whatever they are. It also holds if false spots have the same magnitudes as stars, and if the stated
+error is wrong (then true frames can be missed).
 
 Noise. If no noise is stated, each of the N - 3 values of n is allotted the same share of
 the probability: the expected number is divided by 1 / (N - 3). Any other shares are valid
 too, if they add up to 1 at every attitude and do not depend on where the centroids are. A
-stated noise shows, before any residual is seen, which n will matter: with one star fewer than
-n* an agreement of true stars is typically not certain, with one more it is far beyond certain.
-So n* has the largest share, and every further n has a tenth of the previous share (`_log_share`).
+stated noise shows, before any residual is seen, which n will matter: those whose agreements are
+typically about as rare as the limit of 1e-9. Fewer stars are seldom enough, and more stars need no
+share, because they are far beyond certain. So the share of n falls as the fifth root of the factor
+by which its typical expected number is above or below 1e-9 (`_log_share`).
 """
 
 from __future__ import annotations
@@ -51,7 +59,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from starcat.arrays import Array, Mask
+from starcat.arrays import Array, Deviations
 from starcat.geometry.camera import Camera
 from starcat.matcher.settings import CERTAIN
 
@@ -63,8 +71,17 @@ NO_TERMS = np.empty(0)
 MIN_STARS = 4
 """Smallest number of matched stars: three determine an attitude, a fourth confirms it."""
 
-NEXT_SHARE = 0.1
-"""Share of a number of stars over the share of the next number towards the typical one."""
+LOG_NO_WAYS = -1e30
+"""Stands for the logarithm of 0, so that differences of it are numbers."""
+
+INCOMPATIBLE = 4
+"""Whole deviations of magnitudes that differ by more than a centroid and its star can."""
+
+MAGNITUDE_RATE = 1.0 / 3.0
+"""Rate by which a squared deviation lowers the logarithm of the number of assignments."""
+
+FALL_OF_SHARE = 0.2
+"""Power of the factor from the limit to a typical expected number with which shares fall."""
 
 
 def log_false_match_probability(
@@ -75,16 +92,17 @@ def log_false_match_probability(
     camera: Camera,
     *,
     noise_px: float | None = None,
-    compatible: Mask | None = None,
+    deviations: Deviations | None = None,
     half_ranges: Array = NO_TERMS,
     log_growth: float = 0.0,
     log_attitudes: float = LOG_ALL_ATTITUDES,
 ) -> float:
     """Bound the probability that random centroids agree as well with any attitude: its logarithm.
 
-    ``square_px`` is the sum of the squared residuals. ``rows``, shape (N, 2, 3 + d), are the
-    derivatives of the places of the centroids that agree, in pixels, by three angles and by the d
-    terms that were fitted too. ``half_ranges`` are the largest values of these terms.
+    ``square_px`` is the sum of the squared residuals, those of magnitudes in units of the noise of
+    a place; ``deviations`` are those of all centroids and stars. ``rows``, shape (n, 2, 3 + d), are
+    the derivatives of the places of the centroids that agree, in pixels, by three angles and by the
+    d terms that were fitted too. ``half_ranges`` are the largest values of these terms.
     ``log_attitudes`` is the logarithm of the volume of the attitudes that are searched.
     """
     n = len(rows)
@@ -95,12 +113,14 @@ def log_false_match_probability(
     assignments: Callable[[int], float] = partial(
         log_assignments, n_centroids=n_centroids, stars=stars
     )
-    if compatible is not None:
-        assignments = log_compatible_assignments(most, compatible).item
+    rate = 0.0
+    if deviations is not None:
+        assignments = log_weighted_assignments(most, deviations).item
+        rate = rate_of_magnitudes(noise_px)
     if noise_px is None:
         log_values = math.log(max(1, n_centroids - 3))
     else:
-        log_values = -_log_share(n, most, assignments, noise_px, camera, log_attitudes)
+        log_values = -_log_share(n, most, assignments, noise_px, camera, log_attitudes, rate)
     jacobian = rows.reshape(2 * n, -1)
     gram = jacobian.T @ jacobian
     total = -math.inf
@@ -114,7 +134,8 @@ def log_false_match_probability(
                 continue  # these terms move no place: the face has no volume
             box = sum(math.log(2.0 * half_ranges[term]) for term in terms)
             log_root = 0.5 * log_determinant + log_attitudes - LOG_ALL_ATTITUDES
-            face = _log_expected(assignments(n), n, square_px, log_root, camera, len(columns))
+            expected = _log_expected(assignments(n), n, log_root, camera)
+            face = expected + _log_ball(2 * n - len(columns), square_px, rate)
             total = float(np.logaddexp(total, box + face))
     return min(0.0, total + log_growth + log_values)
 
@@ -126,6 +147,7 @@ class FrameEvidence(NamedTuple):
     square_px: float  # sum of their squared residuals
     # Logarithm of the expected number of agreements, without the ball of the residuals.
     log_number: float
+    rate: float  # of magnitudes, see `rate_of_magnitudes`
 
 
 def evidence_of_frame(
@@ -135,12 +157,13 @@ def evidence_of_frame(
     stars_in_frame: int,
     log_area: float,
     log_attitudes: float,
-    compatible: Mask | None = None,
+    rate: float = 0.0,
+    deviations: Deviations | None = None,
 ) -> FrameEvidence | None:
     """Return the evidence of the spots of a frame; None if they determine no attitude.
 
     The parameters are those of `log_false_match_probability`, but ``log_area`` is the logarithm of
-    the area where the spots can be, pixels squared.
+    the area where the spots can be, pixels squared, and ``rate`` that of magnitudes.
     """
     n = len(rows)
     if n < 2:
@@ -150,11 +173,11 @@ def evidence_of_frame(
     if sign <= 0:
         return None
     assignments = log_assignments(n, n_centroids, max(n, stars_in_frame))
-    if compatible is not None:
-        assignments = float(log_compatible_assignments(n, compatible)[n])
+    if deviations is not None:
+        assignments = float(log_weighted_assignments(n, deviations)[n])
     log_values = math.log(max(1, n_centroids - 1))
     log_number = assignments + log_attitudes + 0.5 * log_determinant - n * log_area + log_values
-    return FrameEvidence(n, square_px, log_number)
+    return FrameEvidence(n, square_px, log_number, rate)
 
 
 def joint_false_match_probability(frames: Sequence[FrameEvidence]) -> float:
@@ -164,8 +187,8 @@ def joint_false_match_probability(frames: Sequence[FrameEvidence]) -> float:
     its frame, whose squared residuals have a sum as low as these.
     """
     n_degrees = sum(2 * frame.n - 3 for frame in frames)
-    square_px = max(math.fsum(frame.square_px for frame in frames), 1e-30)
-    ball = 0.5 * n_degrees * math.log(math.pi * square_px) - math.lgamma(0.5 * n_degrees + 1.0)
+    square_px = math.fsum(frame.square_px for frame in frames)
+    ball = _log_ball(n_degrees, square_px, max(frame.rate for frame in frames))
     return math.exp(min(0.0, ball + math.fsum(frame.log_number for frame in frames)))
 
 
@@ -195,7 +218,8 @@ def largest_squares_px(
     assignments = partial(log_assignments, n_centroids=n_centroids, stars=stars_in_frame)
     log_values = -_log_share(n, most, assignments, noise_px, camera)
     log_root = 3.0 * math.log(camera.focal_length_px)
-    expected = _log_expected(assignments(n), n, 1.0, log_root, camera) + log_values
+    expected = _log_expected(assignments(n), n, log_root, camera) + log_values
+    expected += _log_ball(2 * n - 3, 1.0)
     with np.errstate(divide="ignore"):
         log_margin = math.log(limit) - expected - 0.5 * np.log(information)
     return np.asarray(np.exp(np.minimum(log_margin / (n - 1.5), 700.0)))
@@ -212,24 +236,32 @@ def place_information(body: Array) -> dict[tuple[int, int], Array]:
     return {(i, j): sum(row[i] * row[j] for row in rows) for i in range(3) for j in range(i, 3)}
 
 
-def _log_expected(
-    log_assignments_of_n: float,
-    n: int,
-    square_px: float,
-    log_root: float,
-    camera: Camera,
-    unknowns: int = 3,
-) -> float:
-    """Return the logarithm of the expected number of agreements of n stars.
+def rate_of_magnitudes(noise_px: float | None) -> float:
+    """Return `MAGNITUDE_RATE` per squared pixel; 0 if magnitudes are no residuals."""
+    return 0.0 if noise_px is None else MAGNITUDE_RATE / noise_px**2
+
+
+def _log_expected(log_assignments_of_n: float, n: int, log_root: float, camera: Camera) -> float:
+    """Return the logarithm of the expected number of agreements of n stars, without `_log_ball`.
 
     ``log_root`` is the logarithm of the root of the determinant of the squared derivatives by the
     unknowns, in pixels.
     """
-    n_degrees = 2 * n - unknowns
-    unit_ball = 0.5 * n_degrees * math.log(math.pi) - math.lgamma(0.5 * n_degrees + 1.0)
-    ball = unit_ball + 0.5 * n_degrees * math.log(max(square_px, 1e-30))
     frames = n * math.log(camera.width_px * camera.height_px)
-    return log_assignments_of_n + LOG_ALL_ATTITUDES + log_root + ball - frames
+    return log_assignments_of_n + LOG_ALL_ATTITUDES + log_root - frames
+
+
+def _log_ball(dimensions: int, square_px: float, rate: float = 0.0) -> float:
+    """Return the logarithm of the volume of a ball, by the square of its radius.
+
+    With a ``rate``, the volume times ``exp(-rate s)`` is at least that of the ball of the square
+    less any s.
+    """
+    half = 0.5 * dimensions
+    square_px = max(square_px, 1e-30)
+    excess = rate * square_px / half
+    beyond = half * (excess - 1.0 - math.log(excess)) if excess > 1.0 else 0.0
+    return half * math.log(math.pi * square_px) - math.lgamma(half + 1.0) + beyond
 
 
 def _log_share(
@@ -239,14 +271,15 @@ def _log_share(
     noise_px: float,
     camera: Camera,
     log_attitudes: float = LOG_ALL_ATTITUDES,
+    rate: float = 0.0,
 ) -> float:
-    """Return the logarithm of the share of n, which is at most ``most``.
-
-    The typical number of stars, n*, is the smallest that is `CERTAIN` (`_typical_number`).
-    """
-    typical = _typical_number(most, assignments, noise_px, camera, CERTAIN, log_attitudes)
-    total = sum(NEXT_SHARE ** abs(number - typical) for number in range(MIN_STARS, most + 1))
-    return abs(n - typical) * math.log(NEXT_SHARE) - math.log(total)
+    """Return the logarithm of the share of n, which is at most ``most``."""
+    typical = (
+        _log_typical(number, assignments, noise_px, camera, log_attitudes, rate)
+        for number in range(MIN_STARS, most + 1)
+    )
+    shares = np.array([-FALL_OF_SHARE * abs(log - math.log(CERTAIN)) for log in typical])
+    return float(shares[n - MIN_STARS] - np.logaddexp.reduce(shares))
 
 
 def least_matches(
@@ -254,32 +287,31 @@ def least_matches(
 ) -> int:
     """Return the smallest number of matches that is typically accepted, of ``stars`` in a frame."""
     assignments = partial(log_assignments, n_centroids=n_centroids, stars=stars)
-    return _typical_number(min(n_centroids, stars), assignments, noise_px, camera, limit)
+    most = min(n_centroids, stars)
+    for number in range(MIN_STARS, most):
+        if _log_typical(number, assignments, noise_px, camera) <= math.log(limit):
+            return number
+    return most
 
 
-def _typical_number(
-    most: int,
+def _log_typical(
+    n: int,
     assignments: Callable[[int], float],
     noise_px: float,
     camera: Camera,
-    limit: float,
     log_attitudes: float = LOG_ALL_ATTITUDES,
-) -> int:
-    """Return the smallest number whose agreements are expected at most ``limit`` times.
+    rate: float = 0.0,
+) -> float:
+    """Return the logarithm of the expected number of typical agreements of n stars.
 
-    Their residuals are what noise makes on average, and they are spread over the whole frame. If
-    no number is that rare, it is the largest possible one, ``most``.
+    Their residuals are what noise makes on average, and they are spread over the whole frame.
     """
+    residuals = 2 * n - 3 + (n if rate > 0.0 else 0)
     square_of_frame = (camera.width_px**2 + camera.height_px**2) / 12.0
-    log_spread = math.log(square_of_frame) + 4.0 * math.log(camera.focal_length_px)
-    log_spread += 2.0 * (log_attitudes - LOG_ALL_ATTITUDES)
-    for number in range(MIN_STARS, most):
-        square_px = (2 * number - 3) * noise_px**2
-        log_root = 0.5 * (3.0 * math.log(number) + log_spread)
-        expected = _log_expected(assignments(number), number, square_px, log_root, camera)
-        if expected <= math.log(limit):
-            return number
-    return most
+    log_root = 0.5 * (3.0 * math.log(n) + math.log(square_of_frame))
+    log_root += 2.0 * math.log(camera.focal_length_px) + log_attitudes - LOG_ALL_ATTITUDES
+    expected = _log_expected(assignments(n), n, log_root, camera)
+    return expected + _log_ball(2 * n - 3, residuals * noise_px**2)
 
 
 def log_assignments(n: int, n_centroids: int, stars: int) -> float:
@@ -289,41 +321,47 @@ def log_assignments(n: int, n_centroids: int, stars: int) -> float:
     ) + (math.lgamma(stars + 1) - math.lgamma(stars - n + 1))
 
 
-def log_compatible_assignments(most: int, compatible: Mask) -> Array:
-    """Bound the logarithms of the numbers of assignments of 0 to ``most`` compatible stars.
+def log_weighted_assignments(most: int, deviations: Deviations) -> Array:
+    """Bound the logarithms of the sums of the weights of the assignments of 0 to ``most`` stars.
 
-    Two bounds are taken from the centroids, two from the stars, and the least is returned. Let
-    centroid i have c_i compatible stars. If each centroid of a choice took any of its stars, even
-    one that is taken, the number of assignments would be the product of their c_i; its sum over all
-    choices of n is the elementary symmetric polynomial e_n(c_1, ..., c_N).
+    A pair of a centroid and a star has the weight ``exp(-d^2 / 3)``, d being the whole deviations
+    of their magnitudes (0 if they are `INCOMPATIBLE`), and an assignment the product of its pairs.
 
-    The theorem of Bregman counts stars once: a square matrix of zeros and ones has a permanent of
-    at most the product of ``(r!)^(1/r)`` over its rows, r being their sums. The n rows of a
-    choice, with M - n rows of ones below them, form such a matrix, and each assignment of the
-    choice occurs ``(M - n)!`` times in its permanent. The sum over the choices is therefore at
-    most ``e_n(g_1, ..., g_N) (M!)^((M - n)/M) / (M - n)!``, with ``g_i = (c_i!)^(1/c_i)``
-    (0 if c_i is 0). If all are compatible, this is the number of `log_assignments`.
+    The theorem of Bregman bounds the permanent of a square matrix of zeros and ones by the product
+    of ``(r!)^(1/r)`` over its rows, r being their sums. A permanent is linear in each row, and a
+    row of weights is a sum of rows of zeros and ones: of the pairs that differ by d at most, times
+    what the weight falls from d to d + 1. So the permanent is at most the product of such sums g_i
+    of ``(r!)^(1/r)``. The n rows of a choice, with M - n rows of ones below them, form a square
+    matrix, and each assignment of the choice occurs ``(M - n)!`` times in its permanent. The sum
+    over the choices is therefore at most ``e_n(g_1, ..., g_N) (M!)^((M - n)/M) / (M - n)!``, with
+    the elementary symmetric polynomial e_n. Rows are centroids or stars, whichever are fewer: so
+    the bound is lower. If all weights are 1, it is the number of `log_assignments`.
+
+    Few pairs are compatible if magnitudes are accurate. Then e_n of the sums of the weights of each
+    row, which lets rows have one column, is less, and is returned.
 
     Bregman 1973, "Some properties of nonnegative matrices and their permanents".
     """
-    count, stars = compatible.shape
-    bounds = [np.array([log_assignments(n, count, stars) for n in range(most + 1)])]
-    for degrees, others in ((compatible.sum(axis=1), stars), (compatible.sum(axis=0), count)):
-        degree = degrees[degrees > 0].astype(np.float64)
-        log_factorial = np.array([math.lgamma(d + 1.0) for d in degree])
-        whole = math.lgamma(others + 1)
-        filled = np.array(
-            [(others - n) / others * whole - math.lgamma(others - n + 1) for n in range(most + 1)]
-        )
-        bounds.append(_log_symmetric(np.log(degree), most))
-        bounds.append(_log_symmetric(log_factorial / degree, most) + filled)
-    return np.asarray(np.min(bounds, axis=0))
+    rows = deviations if deviations.shape[0] <= deviations.shape[1] else deviations.T
+    others = rows.shape[1]
+    roots = np.exp([math.lgamma(r + 1.0) / max(r, 1) for r in range(others + 1)])
+    roots[0] = 0.0
+    weight = np.append(np.exp(-MAGNITUDE_RATE * np.arange(INCOMPATIBLE) ** 2), 0.0)
+    sums = np.zeros(len(rows))
+    for d, fall in enumerate(weight[:-1] - weight[1:]):
+        sums += fall * roots[(rows <= d).sum(axis=1)]
+    plain = weight[rows].sum(axis=1)
+    degrees = np.arange(most + 1)
+    filled = (others - degrees) / others * math.lgamma(others + 1)
+    filled -= np.array([math.lgamma(others - n + 1) for n in degrees])
+    least = np.minimum(_log_symmetric(sums, most) + filled, _log_symmetric(plain, most))
+    return np.asarray(np.maximum(least, LOG_NO_WAYS))
 
 
-def _log_symmetric(logs: Array, most: int) -> Array:
+def _log_symmetric(numbers: Array, most: int) -> Array:
     """Return the logarithms of the elementary symmetric polynomials up to a degree."""
     log_sums = np.full(most + 1, -np.inf)
     log_sums[0] = 0.0
-    for log in logs:
+    for log in np.log(numbers[numbers > 0.0]):
         log_sums[1:] = np.logaddexp(log_sums[1:], log_sums[:-1] + log)
     return log_sums

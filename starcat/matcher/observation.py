@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcat.arguments import columns_of, numbers_of, wrong_type
-from starcat.arrays import Array, Directions, Mask, Pixels, Rows
+from starcat.arrays import Array, Deviations, Directions, Mask, Pixels, Rows
 from starcat.database.onboard.layout import MAG_SCALE
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroid_columns import PIXELS, ColumnValues, values_of_columns
 from starcat.matcher.centroids import MeasuredFrame
-from starcat.matcher.chance import LOG_ALL_ATTITUDES, MIN_STARS
+from starcat.matcher.chance import INCOMPATIBLE, LOG_ALL_ATTITUDES, MIN_STARS
 from starcat.matcher.settings import Budget, Settings
 from starcat.matcher.shape import WIDER_RANGE, half_ranges
 
@@ -380,6 +380,19 @@ class Observation:
         # The chord loses no digits at small angles, where the cosine would.
         return np.asarray(2.0 * np.arcsin(0.5 * np.sqrt(dx * dx + dy * dy + dz * dz)))
 
+    def deviations(self, star_mag: Array) -> Deviations | None:
+        """Return by how many whole deviations centroids and stars differ; None without magnitudes.
+
+        It is 0, or `INCOMPATIBLE`, if the noise of a centroid is not stated: the noise of its place
+        is the unit with which magnitudes are compared.
+        """
+        if self.mag is None or self.settings.noise_mag is None:
+            return None
+        found = whole_deviations(self.mag, star_mag, self.settings.noise_mag)
+        if self.settings.noise_px is None:
+            found[found < INCOMPATIBLE] = 0
+        return found
+
     def compatible(self, star_mag: Array, rows: Rows | slice = slice(None)) -> Mask | None:
         """Return which centroids can be which stars by their magnitudes; None if all can be.
 
@@ -387,7 +400,7 @@ class Observation:
         """
         if self.mag is None or self.settings.noise_mag is None:
             return None
-        return compatible_pairs(self.mag[rows], star_mag, self.settings.noise_mag)
+        return _are_compatible(self.mag[rows][:, None], star_mag, self.settings.noise_mag)
 
     def are_compatible(self, rows: Rows, star_mag: Array) -> Mask:
         """Return whether each centroid can be its star by its magnitude; both of one shape."""
@@ -539,14 +552,27 @@ MAG_DEVIATIONS = 3.5
 """Largest difference of the magnitudes of a centroid and its star, in standard deviations."""
 
 
-def compatible_pairs(mag: Array, star_mag: Array, noise_mag: float) -> Mask:
-    """Return which centroids may be which stars by their magnitudes, rounded as in an image."""
-    return _are_compatible(mag[:, None], star_mag, noise_mag)
+def whole_deviations(mag: Array, star_mag: Array, noise_mag: float) -> Deviations:
+    """Return by how many whole standard deviations magnitudes differ, or `INCOMPATIBLE`.
+
+    Magnitudes of stars are rounded as in an image. A magnitude that is not known differs from none.
+    """
+    apart = _mag_apart(mag[:, None], star_mag)
+    whole = np.nan_to_num(apart / noise_mag, posinf=INCOMPATIBLE)
+    return np.where(_is_beyond(apart, noise_mag), INCOMPATIBLE, whole).astype(np.int8)
 
 
 def _are_compatible(mag: Array, star_mag: Array, noise_mag: float) -> Mask:
+    return ~_is_beyond(_mag_apart(mag, star_mag), noise_mag)
+
+
+def _is_beyond(mag_apart: Array, noise_mag: float) -> Mask:
+    return np.asarray(mag_apart > MAG_DEVIATIONS * noise_mag)
+
+
+def _mag_apart(mag: Array, star_mag: Array) -> Array:
     rounded = np.rint(np.asarray(star_mag) * MAG_SCALE) / MAG_SCALE
-    return np.asarray(~(np.abs(mag - rounded) > MAG_DEVIATIONS * noise_mag))
+    return np.asarray(np.abs(mag - rounded))
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array, Directions, Mask, Matrix, Pixels, Rows
-from starcat.matcher.chance import MIN_STARS, log_false_match_probability
+from starcat.arrays import Array, Deviations, Directions, Matrix, Pixels, Rows
+from starcat.matcher.chance import INCOMPATIBLE, MIN_STARS, log_false_match_probability
 from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import (
@@ -395,11 +395,11 @@ class _Fit:
     pose: Pose
     near: Rows  # the stars around the field
     icrs: Directions
-    compatible: Mask | None
+    deviations: Deviations | None  # of the magnitudes of all centroids and the stars ``near``
     predicted_px: Pixels  # the stars ``near`` as the pose puts them; NaN outside of the frame
     star: Rows  # row of ``near`` for each centroid, -1 without a star
     matched: Rows  # centroids with a star
-    square_px: Array
+    square_px: Array  # squared residual of each centroid, with that of its magnitude
 
     @cached_property
     def within(self) -> Rows:
@@ -427,14 +427,16 @@ def _refine(
     near = stars_in_cap(database, pose.matrix[2], radius_rad)
     observation.budget.spend(AGREEMENT * max(1, len(observation) * len(near) // PAIRS))
     u = database.directions[near]
-    compatible = observation.compatible(database.mag[near])
+    deviations = observation.deviations(database.mag[near])
     before: list[int] = []
     for step, factor in enumerate((*wider, *MAX_REFINEMENTS * (1.0,))):
         predicted = pose.camera.pixels_from_directions(u @ pose.matrix.T)
         reach_px = factor * REACH * observation.tolerance_px
         beyond_px = reach_px + margin_px(pose.shape.terms, pose.camera)
         predicted[~is_near_frame(predicted, pose.camera, beyond_px)] = np.nan
-        star, square_px = _mutually_nearest(predicted, pose.px, reach_px, compatible)
+        star, square_px = _mutually_nearest(
+            predicted, pose.px, reach_px, deviations, observation.noise_px
+        )
         matched, after = (star >= 0).nonzero()[0], star.tolist()
         if len(matched) < MIN_STARS or (step >= len(wider) and after == before):
             break
@@ -448,7 +450,7 @@ def _refine(
             star, matched = np.full_like(star, -1), matched[:0]
             break
         pose = fitted
-    return _Fit(pose, near, u, compatible, predicted, star, matched, square_px)
+    return _Fit(pose, near, u, deviations, predicted, star, matched, square_px)
 
 
 def _agreement_of(refined: _Fit, observation: Observation, free: int, certain: float) -> Agreement:
@@ -472,7 +474,8 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int, certain: f
         return Agreement(pose, index, math.nan, 0.0)
     residual_rad = _residual_rad(pose, matched, refined.icrs[refined.star[matched]])
     share = len(matched) / max(1, min(len(refined.within), len(observation)))
-    square_px2 = math.fsum(square_px[matched].tolist())
+    apart = pose.px[matched] - refined.predicted_px[refined.star[matched]]
+    square_px2 = float(np.vdot(apart, apart))
     return Agreement(pose, index, residual_rad, log_chance, min(1.0, share), square_px2=square_px2)
 
 
@@ -501,7 +504,7 @@ def _log_chance(refined: _Fit, matched: Rows, observation: Observation, free: in
         len(within),
         pose.camera,
         noise_px=observation.settings.noise_px,
-        compatible=None if refined.compatible is None else refined.compatible[:, within],
+        deviations=None if refined.deviations is None else refined.deviations[:, within],
         half_ranges=half,
         log_growth=growth,
         log_attitudes=observation.log_attitudes,
@@ -511,12 +514,13 @@ def _log_chance(refined: _Fit, matched: Rows, observation: Observation, free: in
 
 
 def _mutually_nearest(
-    predicted_px: Array, px: Pixels, reach_px: float, compatible: Mask | None
+    predicted_px: Array, px: Pixels, reach_px: float, deviations: Deviations | None, noise_px: float
 ) -> tuple[Rows, Array]:
-    """Return the star of each centroid, -1 without a star, and the squared distances.
+    """Return the star of each centroid, -1 without a star, and the squared residuals.
 
     A centroid has a star if each of the two is the nearest to the other, within reach, among
-    those whose magnitudes are compatible.
+    those whose magnitudes are compatible. The deviation of a magnitude is a residual too, in units
+    of the noise of a place.
     """
     count = len(px)
     if not len(predicted_px):
@@ -526,10 +530,11 @@ def _mutually_nearest(
     square = offset[..., 0]
     square += offset[..., 1]
     # The distance is NaN where the lens forms no image of a star; it must not be the minimum.
-    np.fmin(square, np.inf, out=square)
-    if compatible is not None:
-        square[~compatible] = np.inf
+    np.copyto(square, np.inf, where=~(square <= reach_px * reach_px))
+    if deviations is not None:
+        square += noise_px**2 * np.square(deviations, dtype=np.float64)
+        square[deviations == INCOMPATIBLE] = np.inf
     star, rows = square.argmin(axis=1), np.arange(count)
     nearest = square[rows, star]
-    mutual = (square.argmin(axis=0)[star] == rows) & (nearest <= reach_px * reach_px)
+    mutual = (square.argmin(axis=0)[star] == rows) & np.isfinite(nearest)
     return np.where(mutual, star, -1), nearest

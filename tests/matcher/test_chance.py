@@ -20,13 +20,14 @@ from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes, 
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.matcher.chance import (
+    INCOMPATIBLE,
     log_assignments,
-    log_compatible_assignments,
     log_false_match_probability,
+    log_weighted_assignments,
 )
 from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.observation import compatible_pairs
+from starcat.matcher.observation import whole_deviations
 from starcat.matcher.shape import derivatives
 from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
@@ -158,42 +159,65 @@ def shares(noise_px: float, n_centroids: int, stars: int, **stated) -> dict[int,
 @pytest.mark.parametrize(("n_centroids", "stars"), [(4, 4), (9, 12), (9, 5), (12, 9), (30, 40)])
 @pytest.mark.parametrize("noise_px", [1e-3, 0.3, 1.0, 30.0])
 def test_the_shares_of_all_numbers_add_up_to_one(noise_px, n_centroids, stars):
-    compatible = np.random.default_rng(stars).random((n_centroids, stars)) < 0.8
-    compatible[range(min(n_centroids, stars)), range(min(n_centroids, stars))] = True
-    for stated in ({}, {"compatible": compatible}):
+    deviations = np.random.default_rng(stars).integers(0, 5, (n_centroids, stars), dtype=np.int8)
+    deviations[range(min(n_centroids, stars)), range(min(n_centroids, stars))] = 0
+    for stated in ({}, {"deviations": deviations}):
         found = shares(noise_px, n_centroids, stars, **stated)
         assert sum(found.values()) == pytest.approx(1.0, rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("noise_px", "typical"), [(0.01, 4), (0.3, 5), (0.7, 6), (2.0, 7), (30.0, 9)]
-)
-def test_the_largest_share_is_that_of_the_number_of_stars_that_a_noise_asks_for(noise_px, typical):
-    # Frames of 9 centroids and 12 stars, four to nine of which agree as well as noise lets them:
-    # the fewest that chance would give once in a thousand million frames.
+@pytest.mark.parametrize("noise_px", [0.01, 0.3, 0.7, 2.0, 30.0])
+def test_a_share_falls_with_the_fifth_root_of_the_factor_from_the_limit(noise_px):
+    # Frames of 9 centroids and 12 stars, four to nine of which agree as well as noise lets them.
     found = shares(noise_px, 9, 12)
     places = {n: np.random.default_rng(n).random((100, n, 2)) * 1024.0 for n in found}
     expected = {}
     for n in found:
         square_px = (2 * n - 3) * noise_px**2
         body = [CAMERA.directions_from_pixels(px) for px in places[n]]
-        expected[n] = np.median([by_hand(square_px, one, 9, 12) / 6 for one in body])
-    assert next((n for n in found if expected[n] <= 1e-9), 9) == typical
+        log_number = math.log(np.median([by_hand(square_px, one, 9, 12) / 6 for one in body]))
+        expected[n] = math.exp(-abs(log_number - math.log(1e-9)) / 5.0)
     for n, share in found.items():
-        assert share == pytest.approx(found[typical] * 0.1 ** abs(n - typical), rel=1e-9)
+        # The places of the typical frame are spread as the whole frame is, those here at random.
+        assert share == pytest.approx(expected[n] / sum(expected.values()), rel=0.5)
 
 
 @given(st.integers(4, 9), st.integers(0, 6), st.integers(0, 6), st.integers(0, 99))
 def test_magnitudes_divide_the_bound_by_the_ways_they_leave(n, more, others, seed):
-    compatible = np.random.default_rng(seed).random((n + more, n + others)) < 0.7
-    compatible[range(n), range(n)] = True
+    is_apart = np.random.default_rng(seed).random((n + more, n + others)) < 0.3
+    is_apart[range(n), range(n)] = False
+    deviations = (INCOMPATIBLE * is_apart).astype(np.int8)
     frame = 0.1 * n, directions(n, seed), n + more, n + others, CAMERA
     without = chance_of(*frame)
-    found = chance_of(*frame, compatible=compatible)
-    ways = log_compatible_assignments(n, compatible)[n] - log_assignments(n, n + more, n + others)
+    found = chance_of(*frame, deviations=deviations)
+    ways = log_weighted_assignments(n, deviations)[n] - log_assignments(n, n + more, n + others)
     if without < 1.0:
         assert found == pytest.approx(without * math.exp(ways), rel=1e-9)
     assert found <= without * (1.0 + 1e-12)
+
+
+@given(
+    arrays(np.int8, st.sampled_from([(4, 5), (5, 4), (5, 5)]), elements=st.integers(0, 4)),
+    st.floats(0.1, 40.0),
+)
+def test_a_deviation_is_a_residual(deviations, square):
+    # With both noises stated, the number that is expected is at least the sum over all assignments
+    # of the volumes that their magnitudes leave for the places: by hand, for four stars.
+    noise_px = 0.5
+    frame = directions(4, 3), *deviations.shape, CAMERA
+    stated = {"noise_px": noise_px, "deviations": deviations}
+    found = log_chance_of(square * noise_px**2, *frame, **stated)
+    left = [
+        max(0.0, square - sum(int(deviations[pair]) ** 2 for pair in pairs)) ** 2.5
+        for pairs in (
+            tuple(zip(rows, columns, strict=True))
+            for rows in combinations(range(deviations.shape[0]), 4)
+            for columns in permutations(range(deviations.shape[1]), 4)
+        )
+        if all(deviations[pair] < INCOMPATIBLE for pair in pairs)
+    ]
+    of_one = by_hand(noise_px**2, frame[0], 4, 4) / math.factorial(4)  # if the square is 1
+    assert found == 0.0 or math.exp(found) >= of_one * math.fsum(left) * (1.0 - 1e-6)
 
 
 @pytest.mark.parametrize("square_px", [0.0, 1e-300, 1e9, 1e300])
@@ -232,20 +256,23 @@ class Stated:
     noise_mag: float | None = None
     star_mag: np.ndarray | None = None
 
-    def compatible(self, mag: np.ndarray) -> np.ndarray | None:
+    def deviations(self, mag: np.ndarray) -> np.ndarray | None:
         if self.noise_mag is None:
             return None
-        return compatible_pairs(mag, self.star_mag, self.noise_mag)
+        found = whole_deviations(mag, self.star_mag, self.noise_mag)
+        return found if self.noise_px is not None else np.where(found < INCOMPATIBLE, 0, found)
 
 
 def lowest_bound(centroids_px, u, apart, reach_px: float, stated: Stated, mag) -> float:
     """Return the least bound of all attitudes and all assignments of stars to the centroids."""
     body = CAMERA.directions_from_pixels(centroids_px)
     seen = separation(body[:, None], body[None])
-    joined = stated.compatible(mag)
-    all_joined = np.ones((len(body), len(u)), dtype=bool) if joined is None else joined
+    apart_mag = stated.deviations(mag)
+    joined = np.ones((len(body), len(u)), dtype=bool)
+    if apart_mag is not None:
+        joined = apart_mag < INCOMPATIBLE
     least = 1.0
-    for chosen, stars in assignments(seen, apart, reach_px / CAMERA.focal_length_px, all_joined):
+    for chosen, stars in assignments(seen, apart, reach_px / CAMERA.focal_length_px, joined):
         rays = np.broadcast_to(body[chosen], (len(stars), len(chosen), 3))
         matrices = solve_wahba_svd(rays, u[stars])
         turned = np.einsum("kij,knj->kni", matrices, u[stars]).reshape(-1, 3)
@@ -256,9 +283,13 @@ def lowest_bound(centroids_px, u, apart, reach_px: float, stated: Stated, mag) -
             near = np.flatnonzero(u @ matrices[row, 2] > np.cos(CAMERA.radius_rad))
             inside = CAMERA.contains(CAMERA.pixels_from_directions(u[near] @ matrices[row].T))
             around = near[inside]
-            frame = float(square[row]), body[chosen], len(body), len(around), CAMERA
-            known = None if joined is None else joined[:, np.union1d(around, stars[row])]
-            stating = {"noise_px": stated.noise_px, "compatible": known}
+            known, residual = None, float(square[row])
+            if apart_mag is not None:
+                known = apart_mag[:, np.union1d(around, stars[row])]
+                of_stars = apart_mag[chosen, stars[row]].astype(float)
+                residual += (stated.noise_px or 0.0) ** 2 * float(of_stars @ of_stars)
+            frame = residual, body[chosen], len(body), len(around), CAMERA
+            stating = {"noise_px": stated.noise_px, "deviations": known}
             least = min(least, chance_of(*frame, **stating))
     return least
 
@@ -300,7 +331,9 @@ SLOW = pytest.mark.slow
         # with the second one this depends on how many stars there are around an attitude.
         pytest.param(6, 100, 45.0, 0.01, None, marks=SLOW),
         pytest.param(6, 200, 45.0, 0.2, None, marks=SLOW),
-        (6, 100, 45.0, 0.01, 0.3),
+        # Magnitudes count as residuals: a star may be as far off as its magnitude lets it.
+        (6, 100, 45.0, 10.0, 0.3),
+        (6, 60, 60.0, 10.0, 1.0),
     ],
 )
 def test_no_more_random_frames_agree_than_the_bound_says(
@@ -401,7 +434,8 @@ def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(na
     )
     assert by_noise >= 5
     assert by_mag >= 5
-    assert by_both >= 13  # of two frames the five stars do not determine the corners
+    # Of two frames the five stars do not determine the corners; of three a magnitude is far off.
+    assert by_both >= 9
 
 
 @pytest.mark.slow
@@ -415,59 +449,71 @@ def test_a_star_beyond_the_usual_reach_is_within_that_of_its_noise(narrow_sky):
 
 # --- Assignments: their numbers are those of an enumeration, and never above the bound
 
-GRAPHS = arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=6))
+DEVIATIONS = arrays(
+    np.int8, array_shapes(min_dims=2, max_dims=2, max_side=6), elements=st.integers(0, INCOMPATIBLE)
+)
 
 
-def matchings(compatible: np.ndarray, n: int) -> int:
-    """Count the ways to assign n rows to n columns that they are joined to, one by one."""
-    count, stars = compatible.shape
-    return sum(
-        all(compatible[row, column] for row, column in zip(rows, columns, strict=True))
+def weight(deviation: int) -> float:
+    return 0.0 if deviation == INCOMPATIBLE else math.exp(-(deviation**2) / 3.0)
+
+
+def weighted_ways(deviations: np.ndarray, n: int) -> float:
+    """Sum the weights of the ways to assign n rows to n columns, one by one."""
+    count, stars = deviations.shape
+    return math.fsum(
+        math.prod(
+            weight(deviations[row, column]) for row, column in zip(rows, columns, strict=True)
+        )
         for rows in combinations(range(count), n)
         for columns in permutations(range(stars), n)
     )
 
 
-def bounds_by_hand(compatible: np.ndarray, n: int) -> list[float]:
-    """Return the five bounds as sums of products over all choices."""
-    bounds = [float(math.comb(len(compatible), n) * math.perm(compatible.shape[1], n))]
-    for graph in (compatible, compatible.T):
-        others = graph.shape[1]
-        degrees = graph.sum(axis=1).tolist()
-        roots = [math.factorial(c) ** (1.0 / c) if c else 0.0 for c in degrees]
-        bounds.append(sum(math.prod(chosen) for chosen in combinations(degrees, n)))
-        filled = math.factorial(others) ** ((others - n) / others) / math.factorial(others - n)
-        bounds.append(filled * sum(math.prod(chosen) for chosen in combinations(roots, n)))
-    return bounds
+def bound_by_hand(deviations: np.ndarray, n: int) -> float:
+    """Return the bound as a sum of products over all choices of the side that has fewer."""
+    fewer = deviations if len(deviations) <= deviations.shape[1] else deviations.T
+    others = fewer.shape[1]
+    roots = [0.0, *(math.factorial(r) ** (1.0 / r) for r in range(1, others + 1))]
+    sums = []
+    for row in fewer.tolist():
+        # Of the columns from the heaviest on, each adds its weight times what the root grows by.
+        heaviest = sorted(map(weight, row), reverse=True)
+        sums.append(sum(w * (roots[k + 1] - roots[k]) for k, w in enumerate(heaviest)))
+    filled = math.factorial(others) ** ((others - n) / others) / math.factorial(others - n)
+    plain = [math.fsum(map(weight, row)) for row in fewer.tolist()]
+    return min(
+        factor * math.fsum(math.prod(chosen) for chosen in combinations(numbers, n))
+        for factor, numbers in ((filled, sums), (1.0, plain))
+    )
 
 
-@given(GRAPHS)
-@example(np.array([[True] * 6, [True] * 6, [False] * 6, [True] * 6]))
-def test_the_bound_is_the_least_of_five_and_above_the_number_of_matchings(compatible):
-    most = min(compatible.shape)
-    found = np.exp(log_compatible_assignments(most, compatible))
+@given(DEVIATIONS)
+@example(np.array([[0] * 6, [0] * 6, [INCOMPATIBLE] * 6, [0] * 6], dtype=np.int8))
+def test_the_bound_is_above_the_sum_of_the_weights_of_all_ways(deviations):
+    most = min(deviations.shape)
+    found = np.exp(log_weighted_assignments(most, deviations))
     for n in range(most + 1):
-        number, bounds = matchings(compatible, n), bounds_by_hand(compatible, n)
-        assert all(number <= bound * (1.0 + 1e-12) for bound in bounds)
-        assert found[n] == pytest.approx(min(bounds), rel=1e-12, abs=1e-300)
-        if number == math.comb(len(compatible), n) * math.perm(compatible.shape[1], n):
-            assert found[n] == pytest.approx(number, rel=1e-12)
-    # Centroids and stars may change places.
-    other = np.exp(log_compatible_assignments(most, compatible.T))
-    np.testing.assert_allclose(found, other, rtol=1e-12)
+        ways = weighted_ways(deviations, n)
+        assert ways <= found[n] * (1.0 + 1e-12)
+        assert found[n] == pytest.approx(bound_by_hand(deviations, n), rel=1e-11, abs=1e-300)
+    if (deviations == deviations[0, 0]).all():
+        assert found[most] == pytest.approx(ways, rel=1e-12)
 
 
 @pytest.mark.parametrize("sizes", [(2, 2), (3, 2), (1, 1, 1), (4, 3, 2)])
 def test_groups_that_keep_to_themselves_are_counted_exactly(sizes):
     group = np.repeat(np.arange(len(sizes)), sizes)
-    found = log_compatible_assignments(len(group), group[:, None] == group)[-1]
+    apart = np.where(group[:, None] == group, 0, INCOMPATIBLE)
+    found = log_weighted_assignments(len(group), apart.astype(np.int8))[-1]
     assert math.exp(found) == pytest.approx(math.prod(map(math.factorial, sizes)), rel=1e-12)
 
 
-@pytest.mark.parametrize(("count", "stars"), [(900, 1100), (64, 2000)])
+@pytest.mark.parametrize(("count", "stars"), [(900, 1100), (64, 2000), (2000, 64)])
 def test_large_numbers_do_not_overflow(count, stars):
-    found = log_compatible_assignments(count, np.ones((count, stars), dtype=bool))
-    assert found[-1] == pytest.approx(log_assignments(count, count, stars), rel=1e-12)
+    most = min(count, stars)
+    found = log_weighted_assignments(most, np.zeros((count, stars), dtype=np.int8))
+    assert found[-1] == pytest.approx(log_assignments(most, count, stars), rel=1e-12)
     assert np.isfinite(found).all()
 
 
@@ -480,5 +526,7 @@ def test_the_number_without_magnitudes(n, more, others):
 def test_magnitudes_are_compatible_within_a_closed_interval():
     # All numbers are exact: 3.5 x 0.5 = 1.75.
     mag, stars = np.array([4.0, np.nan]), np.array([2.25, 2.0, 5.75, 6.0, np.nan])
-    found = compatible_pairs(mag, stars, 0.5)
-    assert found.tolist() == [[True, False, True, False, True], [True] * 5]
+    found = whole_deviations(mag, stars, 0.5)
+    assert found.tolist() == [[3, 4, 3, 4, 0], [0] * 5]
+    whole = whole_deviations(np.zeros(1), np.array([0.5, 0.75, 1.0, 1.25, 1.5, 1.625]), 0.5)
+    assert whole.tolist() == [[1, 1, 2, 2, 3, 3]]

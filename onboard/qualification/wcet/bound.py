@@ -360,7 +360,7 @@ def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
         cost, steps = cost + total(costs, "try", **v), steps + 32
         if matched >= 4:
             paid = 16 * (n + within)
-            paid += (n * within + (n + within) * min(n, within)) * has_magnitudes
+            paid += (n * within + min(n, within) ** 2) * has_magnitudes
             bound = total(costs, "bound", **v)
             found("bound", bound, paid)
             found("less", total(costs, "less", **v), 16 * (n + within))
