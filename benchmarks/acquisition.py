@@ -28,8 +28,9 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from false_frames import Scene, Trial
@@ -138,29 +139,45 @@ def try_sequences(
     scene, ended = Scene(stars, stars, kind.noise_px), Counter[str]()
     for attitude in random_attitudes(count, generator):
         tracker, end = Tracker(matcher, max_turn_deg=MAX_TURN_DEG), "none"
-        rate, q = _turn(generator, RATE_DEG * generator.uniform()), quaternion_from_matrix(attitude)
-        for _ in range(FRAMES_OF_SEQUENCE):
-            matrix, near = matrix_from_quaternion(q), {}
-            frame = made_frame(stars, sky, kind, matrix, generator)
-            px = frame.centroids_px
-            if what == "no sky":
-                px = generator.uniform(0.0, 1.0, px.shape) * np.array(
-                    [stars.camera.width_px, stars.camera.height_px]
-                )
-            if what == "wrong prior":
-                wrong = np.array(after_turn(q.tolist(), _turn(generator, WRONG_DEG)))
-                near = {"prior": wrong, "prior_error_deg": MAX_TURN_DEG}
-            found = tracker.identify(px, mag=frame.mag, **near)
-            truths = () if what == "no sky" else (matrix,)
-            trial = Trial(px, frame.mag, truths, noise_px=kind.noise_px)
+        for frame, given in made_sequence(stars, sky, kind, what, attitude, generator):
+            found = tracker.identify(frame.centroids_px, mag=frame.mag, **given)
+            truths = () if what == "no sky" else (frame.matrix,)
+            trial = Trial(frame.centroids_px, frame.mag, truths, noise_px=kind.noise_px)
             verdict = judge_answer(found, trial, scene, matcher.settings.tolerance_px)
-            q = np.array(after_turn(q.tolist(), rate))
             if verdict is not None:
                 route = "alone" if found.origin == "lost_in_space" else "confirmed"
                 end = route if verdict == "right" else "wrong"
                 break
         ended[end] += 1
     return ended
+
+
+def made_sequence(
+    stars: MatcherDatabase,
+    sky: Sky,
+    kind: Kind,
+    what: str,
+    attitude: Matrix,
+    generator: np.random.Generator,
+) -> list[tuple[SimulatedFrame, dict[str, Any]]]:
+    """Return the frames of a sequence, and the prior of each.
+
+    All are drawn, whatever the answers are, so that versions of starcat see the same frames.
+    """
+    rate, q = _turn(generator, RATE_DEG * generator.uniform()), quaternion_from_matrix(attitude)
+    made, given = [], {}
+    for _ in range(FRAMES_OF_SEQUENCE):
+        frame = made_frame(stars, sky, kind, matrix_from_quaternion(q), generator)
+        if what == "no sky":
+            size_px = np.array([stars.camera.width_px, stars.camera.height_px])
+            places_px = generator.uniform(0.0, 1.0, frame.centroids_px.shape) * size_px
+            frame = replace(frame, centroids_px=places_px)
+        if what == "wrong prior":
+            wrong = np.array(after_turn(q.tolist(), _turn(generator, WRONG_DEG)))
+            given = {"prior": wrong, "prior_error_deg": MAX_TURN_DEG}
+        made.append((frame, given))
+        q = np.array(after_turn(q.tolist(), rate))
+    return made
 
 
 def _turn(generator: np.random.Generator, angle_deg: float) -> Turn:

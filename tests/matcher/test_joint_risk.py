@@ -78,7 +78,7 @@ def test_the_joint_bound_of_one_frame_is_its_bound(sky):
 def test_weak_frames_of_a_sequence_confirm_each_other(sky):
     matcher, generator = Matcher(sky, **STATED), np.random.default_rng(5)
     alone = together = confirmed = 0
-    for _ in range(60):
+    for _ in range(120):
         tracker, single = Tracker(matcher, max_turn_deg=1.0), False
         found = None
         for frame in steady_turn(sky, WEAK, generator):
