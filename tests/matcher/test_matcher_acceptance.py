@@ -116,7 +116,7 @@ def test_triangles_identify_nearly_all_and_nothing_wrongly(matcher, noise, share
     assert len(right) >= share * len(answered)
     if noise == Noise():
         errors = [np.abs(error_arcsec(found, frame.matrix)).max() for frame, found in right]
-        assert max(errors) < 1e-6
+        assert max(errors) < 1e-3  # stars of an image are rounded to 5e-5 arcsec
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "triangle"])
