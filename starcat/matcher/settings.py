@@ -115,7 +115,8 @@ class Settings(SearchOptions):
         Standard deviation of the magnitudes of centroids in the band of the database, including
         the error of their zero point. If it is stated, a centroid cannot be a star whose magnitude
         differs by more than 3.5 of it. If ``noise_px`` is stated too, differences of magnitudes
-        are residuals as those of places are.
+        are residuals as those of places are. A value that is too large costs less than one that
+        is too small.
     max_false_match_probability : float
         Answers that chance would give more often than this are withheld; they are then the
         candidate of the refusal. It does not change the search, unless it is below 1e-9: then
