@@ -379,9 +379,9 @@ static double log_ways(uint32_t n, double noise_mag) {
   return (double)unit_work.log_ways[n];
 }
 
-/* Give centroids magnitudes that are so many times the noise of 0.01 off, or of all in turn from the first
- * centroid on, from the magnitude of all stars. Returns the logarithm of the sum of the weights of the
- * ways to assign all centroids to stars. */
+/* Put the magnitude of the first centroid, and those of the others, so many times the noise of 0.01 from
+ * the magnitude of all stars. Returns the logarithm of the sum of the weights of the ways to assign
+ * all centroids to stars. */
 static double log_apart(double first, double others) {
   for (uint32_t i = 0; i < call.own->count; i++) {
     unit_work.magnitude[i] = (starcat_real)(5.0 + 0.01 * (i == 0u ? first : others));
