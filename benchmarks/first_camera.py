@@ -22,7 +22,8 @@ from photographs import is_right
 from rows import LackingError, Options, Rows, ended
 
 from starcat.cli.specs import starter_of_photos
-from starcat.frames.images.solve_files import LocalInputs, answers_of, measure_picture
+from starcat.frames.images.measure import LocalInputs, measure_file
+from starcat.frames.images.solve_files import FileAnswers
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
@@ -53,12 +54,12 @@ def main(rows: Rows) -> None:
     paths = sorted(folder.glob("*.jpg"))
     if not paths:
         raise LackingError(f"photographs in {folder}")
-    measured = [measure_picture(path) for path in paths]
+    measured = [measure_file(path) for path in paths]
 
     def answers(matcher: Matcher) -> list[MatchResult]:
-        given = IdentifyOptions(), LocalInputs()
+        given = matcher.database.camera, IdentifyOptions(), LocalInputs()
         return [
-            next(iter(answers_of(path, one, matcher, *given))).result
+            next(iter(FileAnswers(path, matcher, one, *given))).result
             for path, one in zip(paths, measured, strict=True)
         ]
 

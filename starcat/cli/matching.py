@@ -16,7 +16,8 @@ from starcat.matcher.options import IdentifyOptions, SimulationOptions
 
 if TYPE_CHECKING:
     from starcat.cli.matches import Tally
-    from starcat.frames.images.solve_files import FileAnswers, LocalInputs
+    from starcat.frames.images.measure import LocalInputs
+    from starcat.frames.images.solve_files import FileAnswers
     from starcat.geometry.camera import Camera
     from starcat.matcher.matcher import Matcher
 
@@ -193,7 +194,8 @@ def _identify_batch(
 def _matcher_and_inputs(
     database: Path, parameters: Mapping[str, Any]
 ) -> tuple[Matcher, IdentifyOptions, LocalInputs]:
-    from starcat.frames.images.solve_files import LocalInputs, open_matcher
+    from starcat.frames.images.measure import LocalInputs
+    from starcat.frames.images.solve_files import open_matcher
 
     observer = opt.observer_of_options(
         parameters["time"], parameters["velocity"], parameters["orbit"]

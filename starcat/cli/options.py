@@ -35,7 +35,7 @@ def database(
 
 def _refuse_other_files(path: Path) -> None:
     from starcat.frames.images.batch import CENTROID_SUFFIXES
-    from starcat.frames.images.solve_files import IMAGE_SUFFIXES
+    from starcat.frames.images.contents import IMAGE_SUFFIXES
     from starcat.storage.file_formats import RAW_MAKERS
 
     kinds = {

@@ -553,7 +553,8 @@ DATABASES_AND_FRAMES: Cases = {
     "file of a database missing": checked("rejected.parquet", Path.unlink),
     "database that points to another file": run("selftest {copy}", hdf5(point_elsewhere)),
     "database whose index leads out of its table": run("selftest {copy}", hdf5(set_index)),
-    "frame that is not text": run(IDENTIFY, {"frame.csv": b"\x89PNG\r\n\x1a\n"}),
+    "frame that is not text": run(IDENTIFY, {"frame.csv": b"\0\1\2"}),
+    "damaged picture with the name of a table": run(IDENTIFY, {"frame.csv": b"\x89PNG\r\n\x1a\n"}),
     "frame with a field without end": run(
         IDENTIFY, {"frame.csv": 'x_px,y_px\n1,"' + "2" * 200_000}
     ),

@@ -91,7 +91,7 @@ from typer.testing import CliRunner
 from starcat.cli.main import app
 from starcat.cli.reference import cli_page
 from starcat.frames.images.image_file import write_image
-from starcat.frames.images.solve_files import measure_picture
+from starcat.frames.images.measure import measure_file
 from starcat_service.pages.wording import OPTION_FIELDS, option_hints
 words = "Spots nearer to an edge are ignored."
 with pytest.raises(starcat.StarcatError, match="border_px is 100; expected 0 to 99"):
@@ -109,7 +109,7 @@ picture = Path(mkdtemp()) / "stars.png"
 write_image(picture, (noise + 1000.0 * sum(light)).astype(np.uint16))
 for border_px, count in ((0.0, 2), (10.0, 1)):
     options = starcat.IdentifyOptions(border_px=border_px)
-    assert len(measure_picture(picture, options).frames[0].centroids_px) == count
+    assert len(measure_file(picture, options).frames[0].centroids_px) == count
 """,
     ),
     "command": Recipe(

@@ -15,7 +15,7 @@ from astropy.table import Table
 import starcat
 from starcat.errors import ConfigError
 from starcat.frames.images.image_file import write_image
-from starcat.frames.images.solve_files import measure_picture
+from starcat.frames.images.measure import measure_file
 
 PX = np.array([[455.5, 327.25], [125.0, 266.75], [3.5, 4.5]])
 FLUX = np.array([100.0, 1.0, 10.0])
@@ -48,7 +48,7 @@ def sextractor() -> fits.HDUList:
 
 def check(path: Path) -> tuple[str, ...]:
     """Compare a file with the centroids above; return its remarks."""
-    measured = measure_picture(path)
+    measured = measure_file(path)
     [frame] = measured.frames
     assert measured.shape is None
     assert frame.name == path.stem
@@ -102,26 +102,26 @@ def test_an_image_remains_an_image(tmp_path: Path) -> None:
     (tmp_path / "d.new").write_bytes((tmp_path / "a.fits").read_bytes())
     (tmp_path / "e.fits.gz").write_bytes(gzip.compress((tmp_path / "a.fits").read_bytes()))
     for name in ("a.fits", "b.fits", "c.fits.fz", "d.new", "e.fits.gz"):
-        assert measure_picture(tmp_path / name).shape == (64, 48), name
+        assert measure_file(tmp_path / name).shape == (64, 48), name
 
 
 def test_what_is_wrong_with_a_table_is_said(tmp_path: Path) -> None:
     stars = fits.BinTableHDU.from_columns([fits.Column("RA", "D", array=[1.0])])
     fits.HDUList([fits.PrimaryHDU(), stars]).writeto(tmp_path / "a.fits")
     with pytest.raises(ConfigError, match="a table with the columns RA; expected the columns x_px"):
-        measure_picture(tmp_path / "a.fits")
+        measure_file(tmp_path / "a.fits")
     (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
     with pytest.raises(ConfigError, match=r"a\.parquet: cannot be read as Parquet"):
-        measure_picture(tmp_path / "a.parquet")
+        measure_file(tmp_path / "a.parquet")
     texts = Table({"x_px": ["a", "b"], "y_px": [1.0, 2.0]})
     texts.write(tmp_path / "b.vot", format="votable")
     with pytest.raises(ConfigError, match=r"b\.vot: x_px: not an array of real numbers"):
-        measure_picture(tmp_path / "b.vot")
+        measure_file(tmp_path / "b.vot")
     (tmp_path / "a.vot").write_bytes(b"<?xml version='1.0'?><VOTABLE>")
     with pytest.raises(ConfigError, match=r"a\.vot: cannot be read as VOTable"):
-        measure_picture(tmp_path / "a.vot")
+        measure_file(tmp_path / "a.vot")
     count = pa.array(np.zeros(20_000_000, dtype=np.int8))
     pq.write_table(pa.table({"x_px": count, "y_px": count}), tmp_path / "b.parquet")
     assert (tmp_path / "b.parquet").stat().st_size < 200_000
     with pytest.raises(ConfigError, match="20,000,000 rows"):
-        measure_picture(tmp_path / "b.parquet")
+        measure_file(tmp_path / "b.parquet")

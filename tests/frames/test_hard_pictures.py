@@ -18,8 +18,9 @@ from starcat.frames.images.image_file import (
     without_dead_zones,
     write_image,
 )
+from starcat.frames.images.measure import LocalInputs, measure_file
 from starcat.frames.images.render import Optics, render_image, star_electrons
-from starcat.frames.images.solve_files import FOV_ERROR, LocalInputs, answer_file, measure_picture
+from starcat.frames.images.solve_files import FOV_ERROR, answer_file
 from starcat.frames.images.spots import best_widths
 from starcat.geometry.attitude import random_attitudes
 from starcat.matcher.matcher import Matcher
@@ -76,7 +77,7 @@ def test_stars_of_a_hard_picture_are_found(kind, tmp_path):
     image = in_file_steps(render_image(places, mag, SIZE, optics, 5), taken.scene)
     path = tmp_path / ("a.png" if taken.quality is None else "a.jpg")
     write_image(path, image, **({} if taken.quality is None else {"quality": taken.quality}))
-    [frame] = measure_picture(path).frames
+    [frame] = measure_file(path).frames
     distance, _ = cKDTree(frame.centroids_px).query(places)
     assert (distance < 0.7).sum() >= 26
     if taken.quality is None:  # some of the noise that compression leaves stands out
@@ -204,7 +205,7 @@ def test_a_picture_without_an_answer_is_measured_deeper(small_database, tmp_path
     path = tmp_path / "faint.png"
     size = camera.width_px, camera.height_px
     write_image(path, render_image(places, mag, size, optics, 5))
-    measured = measure_picture(path)
+    measured = measure_file(path)
     [frame] = measured.frames
     first = matcher.identify(frame.centroids_px, camera, mag=frame.mag, fov_error=FOV_ERROR)
     assert not first.ok
@@ -222,8 +223,8 @@ def test_a_dark_frame_takes_hot_pixels_out(tmp_path):
     write_image(tmp_path / "image.fits", image)
     write_image(tmp_path / "dark.fits", lid)
     given = tmp_path / "image.fits", IdentifyOptions(psf_sigma_px=1.0)
-    [bare] = measure_picture(*given).frames
-    [frame] = measure_picture(*given, LocalInputs(dark=tmp_path / "dark.fits")).frames
+    [bare] = measure_file(*given).frames
+    [frame] = measure_file(*given, LocalInputs(dark=tmp_path / "dark.fits")).frames
     assert len(frame.centroids_px) < len(bare.centroids_px)
     distance, _ = cKDTree(frame.centroids_px).query(stars(40, 5)[0])
     assert (distance < 0.5).sum() >= 36
@@ -235,7 +236,7 @@ def test_no_spot_is_found_in_a_dead_zone(tmp_path):
     write_image(tmp_path / "image.png", picture(5))
     write_image(tmp_path / "mask.png", mask)
     local = LocalInputs(mask=tmp_path / "mask.png")
-    [frame] = measure_picture(tmp_path / "image.png", local=local).frames
+    [frame] = measure_file(tmp_path / "image.png", local=local).frames
     places, _ = stars(40, 5)
     assert (frame.centroids_px[:, 0] < 201.0).all()
     distance, _ = cKDTree(frame.centroids_px).query(places[places[:, 0] < 195.0])

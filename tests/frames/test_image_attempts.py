@@ -13,8 +13,9 @@ from starcat.database.products.levels import find_levels, level_fields
 from starcat.frames.images.attempts import MAX_SEARCHES, counted, further_attempts
 from starcat.frames.images.blocks import BLOCK_PX, without_block_edges
 from starcat.frames.images.image_file import write_image
+from starcat.frames.images.measure import LocalInputs, measure_file
 from starcat.frames.images.render import Optics, star_electrons
-from starcat.frames.images.solve_files import LocalInputs, answer_file, measure_picture
+from starcat.frames.images.solve_files import answer_file
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
@@ -69,7 +70,7 @@ def is_right(answer, matrix):
 
 
 def first_search(matcher, path):
-    [frame] = measure_picture(path).frames
+    [frame] = measure_file(path).frames
     camera = matcher.database.camera
     return matcher.identify(frame.centroids_px, camera, mag=frame.mag, fov_error=0.05)
 

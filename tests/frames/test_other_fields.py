@@ -8,7 +8,8 @@ import re
 import numpy as np
 import pytest
 
-from starcat.frames.images.solve_files import LocalInputs, answer_file
+from starcat.frames.images.measure import LocalInputs
+from starcat.frames.images.solve_files import answer_file
 from starcat.geometry.camera import Camera
 from starcat.matcher import other_fields
 from starcat.matcher.matcher import Matcher

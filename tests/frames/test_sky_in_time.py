@@ -23,8 +23,9 @@ from programs import printed_by
 
 from starcat.cli.matches import print_sky_in_time
 from starcat.errors import ConfigError
+from starcat.frames.images.measure import LocalInputs, MeasuredFile
 from starcat.frames.images.picture import draw
-from starcat.frames.images.solve_files import FileAnswers, LocalInputs, MeasuredFile
+from starcat.frames.images.solve_files import FileAnswers
 from starcat.frames.sky.bodies import PHASE_CURVES, apparent_magnitude, bodies_seen
 from starcat.frames.sky.in_time import (
     earth_limb_angle_deg,

@@ -21,8 +21,8 @@ from starcat.frames.images.batch import (
     small_picture,
 )
 from starcat.frames.images.contact_sheet import write_contact_sheet
+from starcat.frames.images.measure import LocalInputs
 from starcat.frames.images.render import write_simulated
-from starcat.frames.images.solve_files import LocalInputs
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion
 from starcat.matcher.database import open_database
 from starcat.matcher.matcher import Matcher

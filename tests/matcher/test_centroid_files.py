@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from starcat.errors import ConfigError
-from starcat.frames.images.solve_files import measure_picture
+from starcat.frames.images.measure import measure_file
 from starcat.matcher.centroid_columns import POSITIONS
 from starcat.matcher.centroids import (
     MeasuredFrame,
@@ -301,10 +301,10 @@ def test_arrays_of_numpy_are_read(tmp_path: Path) -> None:
 def test_a_small_gzip_file_does_not_expand_without_limit(tmp_path: Path) -> None:
     (tmp_path / "a.csv.gz").write_bytes(gzip.compress(b"x_px,y_px\n" + b"\n" * (1 << 27)))
     with pytest.raises(ConfigError, match="expands to more than 67,108,864"):
-        measure_picture(tmp_path / "a.csv.gz")
+        measure_file(tmp_path / "a.csv.gz")
     (tmp_path / "a.csv.gz").write_bytes(gzip.compress(b"x_px,y_px\n1,2\n")[:-4])
     with pytest.raises(ConfigError, match="damaged gzip file"):
-        measure_picture(tmp_path / "a.csv.gz")
+        measure_file(tmp_path / "a.csv.gz")
 
 
 PIECES = ("x_px", "y_px", "mag", "frame", "X", "Y", "NUMBER", "nan", "null", "centroids_px", "é",
@@ -326,7 +326,7 @@ def test_any_text_is_frames_or_a_message(text: str) -> None:
 
 def test_y_upwards_is_turned_where_that_is_asked_for(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x_px,y_px\n10,20\n")
-    [frame] = measure_picture(tmp_path / "a.csv").frames
+    [frame] = measure_file(tmp_path / "a.csv").frames
     assert upside_down(frame, 80).centroids_px.tolist() == [[10.0, 60.0]]
     again = upside_down(MeasuredFrame("a", np.array([[10.0, 60.0]])), 80)
     assert again.centroids_px.tolist() == [[10.0, 20.0]]

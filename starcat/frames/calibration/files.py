@@ -21,7 +21,7 @@ from starcat.errors import ConfigError
 from starcat.frames.calibration.calibrate import Calibration, calibrate_frames
 from starcat.frames.calibration.fit import PARAMETERS
 from starcat.frames.images.batch import frame_files
-from starcat.frames.images.solve_files import measure_picture
+from starcat.frames.images.measure import measure_file
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
 from starcat.matcher.centroids import MeasuredFrame
@@ -175,7 +175,7 @@ def measured_frames(
             frames.append(path)
             continue
         name = next(names)
-        measured = measure_picture(path, IdentifyOptions(flip=flip))
+        measured = measure_file(path, IdentifyOptions(flip=flip))
         for frame in measured.frames:
             frames.append(replace(frame, name=name) if frame.name == path.stem else frame)
         if measured.image is not None:

@@ -19,7 +19,8 @@ from starcat.arrays import Array, Mask, Rows
 from starcat.errors import CalibrationError, ConfigError, count_of
 from starcat.frames.calibration.fit import Fit, Seen, camera_of, project, values_of
 from starcat.frames.calibration.rounds import supported_fit
-from starcat.frames.images.solve_files import FrameAnswer, LocalInputs, identify_either_way
+from starcat.frames.images.measure import LocalInputs
+from starcat.frames.images.solve_files import FrameAnswer, identify_either_way
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions

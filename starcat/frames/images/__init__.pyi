@@ -2,12 +2,12 @@ from starcat.frames.images.background import load_sep as load_sep
 from starcat.frames.images.centroiding import Spots as Spots
 from starcat.frames.images.centroiding import centres_of_mass as centres_of_mass
 from starcat.frames.images.centroiding import find_spots as find_spots
+from starcat.frames.images.contents import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from starcat.frames.images.image_file import wcs_header as wcs_header
 from starcat.frames.images.picture import picture_name as picture_name
 from starcat.frames.images.render import Optics as Optics
 from starcat.frames.images.render import star_electrons as star_electrons
 from starcat.frames.images.render import write_simulated as write_simulated
-from starcat.frames.images.solve_files import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from starcat.frames.images.solve_files import FileAnswers as FileAnswers
 from starcat.frames.images.solve_files import FrameAnswer as FrameAnswer
 from starcat.frames.images.solve_files import answer_file as answer_file

@@ -24,14 +24,10 @@ from numpy.typing import NDArray
 
 from starcat.arguments import path_of
 from starcat.errors import ConfigError
-from starcat.frames.images.solve_files import (
-    IMAGE_SUFFIXES,
-    FrameAnswer,
-    LocalInputs,
-    MeasuredFile,
-    answers_of,
-    measure_picture,
-)
+from starcat.frames.images.contents import IMAGE_SUFFIXES
+from starcat.frames.images.measure import LocalInputs, MeasuredFile, measure_file
+from starcat.frames.images.solve_files import FileAnswers, FrameAnswer
+from starcat.frames.images.stated_camera import stated_camera
 from starcat.matcher.blind import half_widths
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
@@ -133,7 +129,7 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
     frames: list[MeasuredFrame] = []
     for path in files:
         try:
-            frames += measure_picture(path).frames
+            frames += measure_file(path).frames
         except ConfigError as error:
             if len(files) == 1:
                 raise
@@ -197,7 +193,9 @@ def identify_files(
             yield BatchItem(path, error=measured)
             continue
         try:
-            answers = answers_of(path, measured.file, matcher, options, local, tracker)
+            file = measured.file
+            camera, of_file = stated_camera(file.shape, matcher.database, options, local)
+            answers = FileAnswers(path, matcher, file, camera, of_file, local, tracker)
             frame_answers = tuple(answers)
         except ConfigError as error:
             yield BatchItem(path, error=error, small=measured.small)
@@ -237,7 +235,7 @@ def _measured_files(
 def _measured(path: Path, options: IdentifyOptions, local: LocalInputs) -> _Measured | ConfigError:
     """Measure a file; an image itself is too large to be handed on."""
     try:
-        file = measure_picture(path, options, local)
+        file = measure_file(path, options, local)
     except ConfigError as error:
         return ConfigError(
             error.problem,

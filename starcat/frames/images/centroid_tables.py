@@ -16,12 +16,11 @@ import numpy as np
 
 from starcat.arguments import columns_of
 from starcat.errors import ConfigError
-from starcat.frames.images.picture_content import FITS, is_table
+from starcat.frames.images.contents import FITS, Content, is_table
 from starcat.matcher.centroid_columns import EXPECTED, choose_columns, listed
 from starcat.matcher.centroids import (
     MAX_EXPANDED_BYTES,
     MeasuredFrame,
-    data_of_centroids,
     frames_of_data,
     frames_of_table,
 )
@@ -31,9 +30,9 @@ _PARQUET, _XML = b"PAR1", (b"<?xml", b"<VOTABLE")
 Table = Mapping[str, Any]
 
 
-def read_centroid_tables(path: Path) -> list[MeasuredFrame]:
-    """Read the frames of a centroid file of any format."""
-    data = data_of_centroids(path)
+def frames_of_content(content: Content) -> list[MeasuredFrame]:
+    """Return the frames of a file of centroids of any format."""
+    data, path = content.data, content.path
     if data.startswith(FITS):
         return _frames("FITS", _fits_tables, data, path)
     if data.startswith(_PARQUET):

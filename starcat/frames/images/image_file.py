@@ -28,17 +28,18 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.errors import ConfigError
-from starcat.frames.images.picture_content import (
+from starcat.frames.images.contents import (
     FITS,
-    MAX_EXPANDED_BYTES,
+    MAX_EXPANDED_FITS_BYTES,
     MAX_PIXELS,
+    RAW_PICTURE,
+    Content,
     check_pixels,
-    kind_of,
-    unpacked,
+    read_content,
 )
 from starcat.matcher.result import MatchResult
 from starcat.storage.atomic import write_file
-from starcat.storage.file_formats import RAW_MAKERS, unread_format
+from starcat.storage.file_formats import unread_format
 from starcat.version import install_command
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ Grey = NDArray[np.float32] | Array
 
 _log = logging.getLogger(__name__)
 
+_IMAGE = "an image"  # what a file has to be, for messages
 _OF_PILLOW = ("PNG", "TIFF", "JPEG", "BMP")
 # Kind of file that is written for each suffix.
 WRITTEN_KINDS = {
@@ -74,12 +76,16 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     top row first, which is what is assumed here; viewers show the first row at the bottom. A
     frame that is read upside down is a mirror image, and no mirror image is ever identified.
     """
-    data = unpacked(path)
-    kind = kind_of(data)
-    if path.suffix.lower() in RAW_MAKERS:
-        kind = "a raw picture"
-    unread = unread_format(path, data)
-    if kind is None or (kind == "TIFF" and unread is not None):  # raw images begin as TIFF
+    return image_of_content(read_content(path, _IMAGE), flip=flip, plane=plane)
+
+
+def image_of_content(
+    content: Content, *, flip: bool | None = None, plane: int | None = None
+) -> Grey:
+    """Return the grey values of the content of an image, as `read_image` does."""
+    path, data, kind = content.path, content.data, content.kind
+    if kind is None:
+        unread = unread_format(path, data)
         if unread is not None:
             raise ConfigError(
                 f"is {unread}, which is not supported",
@@ -94,13 +100,13 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     try:
         if kind == "FITS":
             values, upside_down = _read_fits(data, path, plane)
-        elif kind == "a raw picture":
+        elif kind == RAW_PICTURE:
             values, upside_down = _grey_of_raw(data), False
         elif kind == "HEIC":
             values, upside_down = _grey_of_heic(data), False
         else:
             with warnings.catch_warnings(action="ignore"):  # about tags, and about its size
-                values, upside_down = _grey_of_picture(data), False
+                values, upside_down = _grey_of_picture(data, kind), False
     except ConfigError as error:
         error.at(path)
         raise
@@ -142,9 +148,10 @@ def _check_planes(part: Any) -> None:
     from astropy.io import fits
 
     size = abs(int(part.header["BITPIX"])) // 8 * int(np.prod(part.shape, dtype=object))
-    if isinstance(part, fits.CompImageHDU) and size > MAX_EXPANDED_BYTES:
+    if isinstance(part, fits.CompImageHDU) and size > MAX_EXPANDED_FITS_BYTES:
         raise ConfigError(
-            f"expands to {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} are read", hint="Cut it"
+            f"expands to {size:,} bytes; at most {MAX_EXPANDED_FITS_BYTES:,} are read",
+            hint="Cut it",
         )
 
 
@@ -180,13 +187,15 @@ def _shapes_text(shapes: list[tuple[int, ...]]) -> str:
     )
 
 
-def _grey_of_picture(data: bytes) -> NDArray[Any]:
+def _grey_of_picture(data: bytes, kind: str) -> NDArray[Any]:
     from PIL import Image, UnidentifiedImageError
 
     try:
         picture = Image.open(io.BytesIO(data), formats=_OF_PILLOW)
     except UnidentifiedImageError as error:
-        raise ConfigError("damaged, or a variety that Pillow does not know") from error
+        raise ConfigError(
+            f"begins as {kind}, but is damaged, or a variety that Pillow does not know"
+        ) from error
     except Image.DecompressionBombError as error:  # a header with twice Pillow's own limit
         raise ConfigError(
             f"has more than {MAX_PIXELS / 1e6:.0f} million pixels", hint="cut it, or reduce it"
@@ -282,7 +291,7 @@ def _bits(data: bytes, picture: Any) -> tuple[int, bool]:
 
 def time_in_file(path: Path) -> datetime | None:
     """Return the middle of the exposure from a FITS header or EXIF, as UTC; None without one."""
-    data = unpacked(path)
+    data = read_content(path, _IMAGE).data
     try:
         moment = _time_of_fits(data) if data.startswith(FITS) else _time_of_exif(data)
     except ConfigError as error:
@@ -409,7 +418,7 @@ def write_wcs(
     """Write a FITS copy of a picture with the world coordinates of its answer."""
     from astropy.utils.exceptions import AstropyWarning
 
-    data = unpacked(source)
+    data = read_content(source, _IMAGE).data
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyWarning)  # about headers, as cameras write them
@@ -432,7 +441,7 @@ def wcs_header(result: MatchResult, source: Path, *, flip: bool | None = None) -
         header["IMAGEW"] = (camera.width_px, "width of the frame, pixels")
         header["IMAGEH"] = (camera.height_px, "height of the frame, pixels")
     bottom_up = bool(flip)
-    data = unpacked(source)
+    data = read_content(source, _IMAGE).data
     if data.startswith(FITS) and flip is None:
         with fits.open(io.BytesIO(data), memmap=False) as parts:
             bottom_up = _is_bottom_up(_image_part(parts).header)

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +27,11 @@ from starcat.frames.images.attempts import (
     further_attempts,
     is_new,
 )
-from starcat.frames.images.centroid_tables import read_centroid_tables
-from starcat.frames.images.picture_content import holds_picture
+from starcat.frames.images.measure import FrameFile, LocalInputs, MeasuredFile, read_frame_file
 from starcat.frames.images.spots import weighed
+from starcat.frames.images.stated_camera import stated_camera
 from starcat.geometry.camera import Camera
-from starcat.matcher.blind import check_range_served, fields_served, half_widths
-from starcat.matcher.centroids import MeasuredFrame, read_stdin, upside_down
+from starcat.matcher.centroids import MeasuredFrame, upside_down
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions, SearchOptions, options_of
 from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, explained
@@ -49,51 +48,6 @@ if TYPE_CHECKING:
     from starcat.frames.sky.observer import Observer
 
 Content = dict[str, Any]
-
-STDIN = Path("-")
-
-# Files that are read as images, unless they are FITS tables; all others hold centroids.
-IMAGE_SUFFIXES = (
-    ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".heic",
-    ".heif", ".bmp",
-)  # fmt: skip
-
-CAMERA_NAME = "camera.toml"  # name of the text of a camera file in messages
-
-
-@dataclass(frozen=True)
-class LocalInputs:
-    """Inputs in addition to the options, only for users who run starcat on their own machine."""
-
-    camera: Camera | None = None  # replaces the text of a camera file
-    dark: Path | None = None  # an image with the lid on, which is subtracted
-    mask: Path | None = None  # an image; pixels that are not zero are ignored
-    observer: Observer | None = None
-    track: bool = False  # the frames are a sequence
-    # The expected attitude or boresight, and its error; replaces the quaternion of the options.
-    prior: tuple[Any, Any] | None = None
-    may_narrow: bool = False  # of a range of fields, only the part that the database serves is used
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredFile:
-    """The centroids of a file, and the image (height, width) that they were found in, if any.
-
-    If the file is one of many, the image is not kept, but its shape is.
-    """
-
-    frames: Sequence[MeasuredFrame]
-    image: NDArray[Any] | None = None
-    shape: tuple[int, ...] | None = None  # shape of the image; None for a file of centroids
-    spots: Spots | None = None  # centroids with their errors; None for a file of centroids
-
-    def brightest(self, count: int) -> MeasuredFile:
-        """Return an image with fewer of its spots, the brightest."""
-        frames, spots = self.frames, self.spots
-        if spots is not None:
-            spots = spots.at(slice(count))
-            frames = [MeasuredFrame(frames[0].name, spots.centroids_px, spots.mag)]
-        return replace(self, frames=frames, spots=spots)
 
 
 @dataclass(frozen=True)
@@ -154,10 +108,10 @@ class FileAnswers:
             frame = upside_down(measured, self.camera.height_px) if turned else measured
             answer = self._answer(frame, error)
             result = answer.result
-            if self.local.observer is not None:
+            if answer.observer is not None:
                 from starcat.frames.sky.in_time import with_planets
 
-                result = with_planets(result, self.local.observer)
+                result = with_planets(result, answer.observer)
             if turned or self.is_image:
                 given_as: GivenAs = "picture" if self.is_image else "upside_down"
                 result = result.with_facts(given_as=given_as)
@@ -169,7 +123,7 @@ class FileAnswers:
             yield answer
 
     def _answer(self, frame: MeasuredFrame, fov_error: float) -> FrameAnswer:
-        observer, spots = self.local.observer, self.measured.spots
+        observer, spots = self._observer, self.measured.spots
         result = self._search(frame, fov_error, self.camera)
         if not result.ok and fov_error and self.options.fov_error is None:
             # Few stars can determine an attitude, but no focal length with it: it is as stated.
@@ -230,7 +184,7 @@ class FileAnswers:
             result = counted(self._search(frame, fov_error, self.camera), limit)
             if result is not None:
                 result = weighed(result, spots.sigma_px)
-                return FrameAnswer(frame, result, self.local.observer, spots, attempt)
+                return FrameAnswer(frame, result, self._observer, spots, attempt)
         return None
 
     def _measured_again(self, attempt: FurtherAttempt) -> MeasuredFile | None:
@@ -238,25 +192,35 @@ class FileAnswers:
         if attempt.threshold is None:
             return self.measured.brightest(BRIGHTEST)
         try:
-            image: NDArray[Any] | None = self._image
-            if attempt.without_blocks:
+            image = self._image
+            if attempt.without_blocks and image is not None:
                 from starcat.frames.images.blocks import without_block_edges
 
-                image = without_block_edges(self._image)
+                image = without_block_edges(image)
             if image is None:
                 return None
-            return measure_picture(
-                self.path, attempt.options(self.options), self.local, image=image,
-                without_hot_pixels=attempt.without_hot_pixels,
-            )  # fmt: skip
+            return FrameFile(self.path, image=image).measured(
+                attempt.options(self.options), without_hot_pixels=attempt.without_hot_pixels
+            )
         except ConfigError:  # too much stands out: keep the result of the first measurement
             return None
 
     @cached_property
-    def _image(self) -> NDArray[Any]:
-        """The image, read again if it was not kept."""
+    def _image(self) -> NDArray[Any] | None:
+        """The image, read again if it was not kept; None for centroids."""
         image = self.measured.image
-        return _read_picture(self.path, self.options, self.local) if image is None else image
+        return (
+            read_frame_file(self.path, self.options, self.local).image if image is None else image
+        )
+
+    @cached_property
+    def _observer(self) -> Observer | None:
+        """When and from where the frames were taken; None if that is not stated."""
+        if self.local.observer is not None or self.options.time is None:
+            return self.local.observer
+        from starcat.frames.sky.observer import Observer
+
+        return Observer.at(self.options.time)
 
     def _check_size(self) -> None:
         camera, shape = self.camera, self.measured.shape
@@ -370,8 +334,10 @@ class FileAnswers:
             write_wcs(path, self.path, self.measured.image, answer.result, flip=self.options.flip)
 
 
-def _is_bright(image: NDArray[Any]) -> bool:
+def _is_bright(image: NDArray[Any] | None) -> bool:
     """Return whether most of an image is nearer to its brightest than to its darkest pixel."""
+    if image is None:
+        return False
     low, middle, high = np.nanquantile(image, (0.0, 0.5, 1.0))
     return bool(2.0 * middle > low + high or low == high > 0.0)
 
@@ -466,29 +432,11 @@ def answer_file(
     """Measure a file, or ``-`` for stdin, and identify its frames when they are requested."""
     options, local = options or IdentifyOptions(), local or LocalInputs()
     matcher = database if isinstance(database, Matcher) else open_matcher(database, options)
-    image = _checked_picture(path, matcher, options, local)
-    return answers_of(
-        path, measure_picture(path, options, local, image=image), matcher, options, local
-    )
-
-
-def _checked_picture(
-    path: Path, matcher: Matcher, options: IdentifyOptions, local: LocalInputs
-) -> NDArray[Any] | None:
-    """Return the image of a picture if a range of fields is stated, which is checked with it.
-
-    Finding the stars takes seconds, so a range that the database does not serve is refused before.
-    """
-    if options.fov_deg is None or options.is_one_field:
-        return None
-    half_widths(matcher.database)
-    if not is_picture(path):
-        return None
-    image = _read_picture(path, options, local)
-    camera = _camera_of_size(image.shape, options.size_px, local.camera or matcher.database.camera)
-    check = fields_served if local.may_narrow else check_range_served
-    check(matcher.database, camera, options.fov_deg)
-    return image
+    file = read_frame_file(path, options, local)
+    # Finding the stars takes seconds: a camera that cannot be used is refused before.
+    camera, options = stated_camera(file.shape, matcher.database, options, local)
+    tracker = Tracker(matcher) if local.track else None
+    return FileAnswers(path, matcher, file.measured(options), camera, options, local, tracker)
 
 
 def identify_either_way(
@@ -502,126 +450,3 @@ def identify_either_way(
         if refusal is None or refusal.reason != "mirrored":
             break
     return answers, frame_answers
-
-
-def answers_of(
-    path: Path,
-    measured: MeasuredFile,
-    matcher: Matcher,
-    options: IdentifyOptions,
-    local: LocalInputs,
-    tracker: Tracker | None = None,
-) -> FileAnswers:
-    """Return the answers to a file that is measured."""
-    camera = local.camera or matcher.database.camera
-    if options.camera is not None:
-        # Reading a camera needs the spec, whose import takes longer than a frame.
-        from starcat.pipeline.specs.camera_file import parse_camera
-
-        # A text without a size is of a camera whose images are as large as this one.
-        size_px = (camera.width_px, camera.height_px)
-        if measured.shape is not None:
-            size_px = (measured.shape[1], measured.shape[0])
-        camera = parse_camera(options.camera, Path(CAMERA_NAME), size_px)
-    fov_deg = options.fov_deg
-    if fov_deg is not None:
-        camera = _camera_of_size(measured.shape, options.size_px, camera)
-        if options.is_one_field:
-            flat = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg[0])
-            camera = camera.with_focal_length(flat.focal_length_px)
-            options = replace(options, fov_deg=None, size_px=None)
-        elif local.may_narrow:
-            served = fields_served(matcher.database, camera, fov_deg)
-            options = replace(options, fov_deg=served)
-    if options.time is not None and local.observer is None:
-        from starcat.frames.sky.observer import Observer
-
-        local = replace(local, observer=Observer.at(options.time))
-    if local.track and tracker is None:
-        tracker = Tracker(matcher)
-    return FileAnswers(path, matcher, measured, camera, options, local, tracker)
-
-
-def measure_picture(
-    path: Path,
-    options: IdentifyOptions | None = None,
-    local: LocalInputs | None = None,
-    *,
-    without_hot_pixels: bool = False,
-    image: NDArray[Any] | None = None,
-) -> MeasuredFile:
-    """Read centroids, or find them in an image, which is read too unless it is given."""
-    options = options or IdentifyOptions()
-    if path == STDIN:
-        # Its frames are only ever gone through.
-        return MeasuredFile(cast(Sequence[MeasuredFrame], read_stdin()))
-    if image is None and not is_picture(path):
-        return MeasuredFile(read_centroid_tables(path))
-    from starcat.frames.images.centroiding import find_spots
-
-    if image is None:
-        image = _read_picture(path, options, local or LocalInputs())
-    try:
-        spots = find_spots(
-            image,
-            threshold_sigma=options.threshold,
-            psf_sigma_px=options.psf_sigma_px,
-            most_spots=options.most_spots,
-            without_hot_pixels=without_hot_pixels,
-        )
-    except ConfigError as error:
-        error.at(path)
-        raise
-    frame = MeasuredFrame(path.stem, spots.centroids_px, spots.mag)
-    return MeasuredFile([frame], image, image.shape, spots)
-
-
-def is_picture(path: Path) -> bool:
-    """Return whether a file is read as a picture: by its content, else by its name."""
-    by_content = holds_picture(path)
-    return path.suffix.lower() in IMAGE_SUFFIXES if by_content is None else by_content
-
-
-def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> NDArray[Any]:
-    from starcat.frames.images.image_file import (
-        grey_of_mosaic,
-        read_image,
-        without_dark,
-        without_dead_zones,
-    )
-
-    flip = options.flip
-    image: NDArray[Any] = read_image(path, flip=flip, plane=options.plane)
-    dark, mask = (
-        None if file is None else read_image(file, flip=flip) for file in (local.dark, local.mask)
-    )
-    try:
-        if dark is not None:
-            image = without_dark(image, dark)
-        if options.bayer:
-            image = grey_of_mosaic(image)
-        if mask is not None:
-            image = without_dead_zones(image, mask)
-    except ConfigError as error:  # the message does not know the picture
-        error.at(path)
-        raise
-    return image
-
-
-def _camera_of_size(
-    shape: tuple[int, ...] | None, size_px: tuple[int, int] | None, camera: Camera
-) -> Camera:
-    """Return the camera of an image of some shape, or of centroids."""
-    width, height = size_px or (camera.width_px, camera.height_px)
-    if shape is not None:
-        height, width = shape
-        if size_px not in (None, (width, height)):
-            raise ConfigError(
-                f"the image has {width} x {height} px",
-                parameter="size_px",
-                value=size_px,
-                hint="leave it out",
-            )
-    if (width, height) == (camera.width_px, camera.height_px):
-        return camera
-    return Camera(width, height, fov_x_deg=camera.fov_x_deg)

@@ -17,7 +17,7 @@ from PIL import Image
 
 import starcat
 from starcat.errors import ConfigError
-from starcat.frames.images import image_file, picture_content
+from starcat.frames.images import contents, image_file
 from starcat.frames.images.image_file import read_image, write_image
 
 SIDE = 12_000
@@ -86,7 +86,7 @@ def test_refusing_a_large_picture_takes_little_memory(tmp_path):
 
 def test_every_kind_of_picture_has_the_limit(tmp_path, monkeypatch):
     """With a limit of 1000 pixels in place of 134 million."""
-    for module in (picture_content, image_file):
+    for module in (contents, image_file):
         monkeypatch.setattr(module, "MAX_PIXELS", 1000)
     for side in (30, 40):
         image = np.arange(side * side, dtype=np.uint16).reshape(side, side)
@@ -120,8 +120,8 @@ def test_a_picture_of_pillow_beyond_its_own_limit_is_refused(tmp_path):
 
 
 def test_a_gzip_file_has_a_limit_whatever_it_holds(tmp_path, monkeypatch):
-    monkeypatch.setattr(picture_content, "MAX_EXPANDED_PICTURE_BYTES", 5_000)
-    monkeypatch.setattr(picture_content, "MAX_EXPANDED_BYTES", 50_000)
+    monkeypatch.setattr(contents, "MAX_EXPANDED_PICTURE_BYTES", 5_000)
+    monkeypatch.setattr(contents, "MAX_EXPANDED_FITS_BYTES", 50_000)
     write_image(tmp_path / "a.tif", np.zeros((64, 64), dtype=np.uint8))
     with_more = (tmp_path / "a.tif").read_bytes() + bytes(5_000)
     (tmp_path / "a.tif.gz").write_bytes(gzip.compress(with_more))
@@ -133,7 +133,7 @@ def test_a_gzip_file_has_a_limit_whatever_it_holds(tmp_path, monkeypatch):
         read_image(tmp_path / "b.fits.gz")
     cube = fits.CompImageHDU(np.zeros((40, 30, 30), dtype=np.int16))
     fits.HDUList([fits.PrimaryHDU(), cube]).writeto(tmp_path / "c.fits.fz")
-    monkeypatch.setattr(image_file, "MAX_EXPANDED_BYTES", 50_000)
+    monkeypatch.setattr(image_file, "MAX_EXPANDED_FITS_BYTES", 50_000)
     with pytest.raises(ConfigError, match="expands to 72,000 bytes; at most 50,000 are read"):
         read_image(tmp_path / "c.fits.fz", plane=3)
 
@@ -159,3 +159,40 @@ def test_one_bad_file_of_many_is_named_with_the_way_around_it(tmp_path):
     (tmp_path / "b.csv").unlink()
     assert len(starcat.read_frames(str(tmp_path / "*.csv"))) == 2
     assert len(starcat.read_frames(tmp_path)) == 2
+
+
+def test_the_content_of_a_picture_counts_and_not_its_name(tmp_path):
+    image = np.arange(30 * 40, dtype=np.uint8).reshape(30, 40)
+    for suffix in (".png", ".tif", ".jpg", ".fits"):
+        write_image(tmp_path / f"a{suffix}", image)
+        data = (tmp_path / f"a{suffix}").read_bytes()
+        for name, content in (("a", data), ("a.csv", data), ("a.csv.gz", gzip.compress(data))):
+            (tmp_path / name).write_bytes(content)
+            assert contents.read_content(tmp_path / name).is_picture, (suffix, name)
+    table = b"BMAG,x_px,y_px\n1,2,3\n"  # begins as BMP does
+    for name, content in (("b.csv", table), ("b.csv.gz", gzip.compress(table))):
+        (tmp_path / name).write_bytes(content)
+        [frame] = starcat.read_frames(tmp_path / name)
+        assert frame.centroids_px.tolist() == [[2.0, 3.0]]
+
+
+def test_a_file_is_read_once(tmp_path, monkeypatch):
+    read = []
+    reader = contents.read_regular_file
+
+    def counted(path, max_bytes):
+        read.append(path.name)
+        return reader(path, max_bytes)
+
+    monkeypatch.setattr(contents, "read_regular_file", counted)
+    write_image(tmp_path / "a.fits", np.zeros((30, 40), dtype=np.float32))
+    (tmp_path / "b.csv").write_text("x_px,y_px\n1,2\n")
+    starcat.read_frames(str(tmp_path / "*"))
+    assert sorted(read) == ["a.fits", "b.csv"]
+
+
+def test_a_file_of_centroids_has_a_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr(contents, "MAX_BYTES", 1_000)
+    (tmp_path / "a.csv").write_text("x_px,y_px\n" + "1,2\n" * 300)
+    with pytest.raises(ConfigError, match=r"a\.csv: has more than 1,000 bytes of centroids"):
+        starcat.read_frames(tmp_path / "a.csv")

@@ -1,6 +1,6 @@
-"""Contents of picture files: their kinds, and compressed files expanded within stated limits.
+"""Contents of files of frames: read once, expanded within stated limits, and what they are.
 
-The kind of a file is detected from its first bytes. The number of pixels is read from a header
+The kind of a picture is detected from its first bytes. The number of pixels is read from a header
 before the pixels are expanded.
 """
 
@@ -12,12 +12,15 @@ import re
 import warnings
 import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcat.errors import ConfigError, FileMissing, SourceError
+from starcat.matcher.centroids import MAX_BYTES, MAX_EXPANDED_BYTES
 from starcat.storage.compressed import (
     GZIP,
     damaged_gzip,
@@ -25,8 +28,8 @@ from starcat.storage.compressed import (
     expanded_beginning,
     expands_too_far,
 )
-from starcat.storage.file_formats import RAW_MAKERS
-from starcat.storage.regular_files import check_regular_file, read_regular_file
+from starcat.storage.file_formats import RAW_MAKERS, unread_format
+from starcat.storage.regular_files import read_regular_file
 
 if TYPE_CHECKING:
     from astropy.io.fits import Header
@@ -34,11 +37,12 @@ if TYPE_CHECKING:
 MAX_FILE_BYTES = 4 << 30
 MAX_PIXELS = 1 << 27
 """Largest number of pixels of a picture: a detector of 11,585 x 11,585."""
-MAX_EXPANDED_BYTES = 8 * MAX_PIXELS
+MAX_EXPANDED_FITS_BYTES = 8 * MAX_PIXELS
 """Largest size of a compressed FITS file after expansion."""
 MAX_EXPANDED_PICTURE_BYTES = 1 << 28
 """Largest size of another picture in gzip after expansion; most kinds are compressed themselves."""
 FITS = b"SIMPLE  ="
+_SIGNATURE_BYTES = 64  # more than the signature of any kind has
 _BLOCK_BYTES = 2880  # FITS files consist of blocks of this size
 
 _KINDS = {
@@ -51,23 +55,83 @@ _KINDS = {
     b"\xff\xd8\xff": "JPEG",
     b"BM": "BMP",
 }
+IMAGE_SUFFIXES = (
+    ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".heic",
+    ".heif", ".bmp",
+)  # fmt: skip
+"""Suffixes of pictures, for names of files in folders and for contents of an unknown kind."""
+
 # Brands of the container of HEIC, at byte 8, after its size and "ftyp".
 _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 
 
-def unpacked(path: Path) -> bytes:
-    """Return the content of a picture's file, expanded if it is in gzip."""
+CENTROIDS_OR_IMAGE = "centroids (CSV, JSON) or an image"
+RAW_PICTURE = "a raw picture"
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """The content of a file of frames, expanded if it is in gzip."""
+
+    path: Path
+    data: bytes
+
+    @cached_property
+    def kind(self) -> str | None:
+        """The kind of a picture; None if it is none that starcat reads."""
+        if self.path.suffix.lower() in RAW_MAKERS:
+            return RAW_PICTURE
+        kind = _kind_of(self.data)
+        # Raw pictures of cameras begin as TIFF images.
+        is_raw = kind == "TIFF" and unread_format(self.path, self.data) is not None
+        return None if is_raw else kind
+
+    @cached_property
+    def is_picture(self) -> bool:
+        """Whether it is read as a picture, and not as centroids."""
+        if self.kind == "FITS":
+            return _has_image(self.data)
+        if self.kind in (None, "BMP"):  # a table of text can begin with BM
+            name = self.path.name.lower().removesuffix(".gz")
+            return name.endswith(IMAGE_SUFFIXES)
+        return True
+
+
+def read_content(path: Path, expected: str = CENTROIDS_OR_IMAGE) -> Content:
+    """Read a file of frames.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    expected : str
+        What the file has to be, for messages.
+
+    Raises
+    ------
+    FileMissing, ConfigError
+        If there is no such file, it cannot be read, or it is too large, also after expansion.
+    """
     try:
         data = read_regular_file(path, MAX_FILE_BYTES)
     except FileMissing as error:
-        raise FileMissing("no such file", where=path, hint="give an image") from error
+        raise FileMissing("no such file", where=path, hint=f"give {expected}") from error
     except SourceError as error:
-        raise ConfigError(f"{error}; expected an image") from error
+        raise ConfigError(f"{error}; expected {expected}") from error
     if not data.startswith(GZIP):
-        return data
-    if expanded_beginning(data, len(FITS)) == FITS:
-        return _expanded_fits(data, path)
-    return expanded(data, MAX_EXPANDED_PICTURE_BYTES, path)
+        content = Content(path, data)
+        if len(data) > MAX_BYTES and not content.is_picture:
+            raise ConfigError(f"has more than {MAX_BYTES:,} bytes of centroids", where=path)
+        return content
+    beginning = expanded_beginning(data, _SIGNATURE_BYTES)
+    if beginning.startswith(FITS):
+        content = Content(path, _expanded_fits(data, path))
+        if len(content.data) > MAX_EXPANDED_BYTES and not content.is_picture:
+            raise expands_too_far(path, len(data), MAX_EXPANDED_BYTES)
+        return content
+    is_picture = Content(path, beginning).is_picture
+    limit = MAX_EXPANDED_PICTURE_BYTES if is_picture else MAX_EXPANDED_BYTES
+    return Content(path, expanded(data, limit, path))
 
 
 def _expanded_fits(data: bytes, path: Path) -> bytes:
@@ -95,8 +159,8 @@ def _expanded_fits(data: bytes, path: Path) -> bytes:
                 size = _data_bytes(header)
                 if _is_image_header(header):
                     check_pixels(_shape_of(header), str(path))
-                if len(content) + size > MAX_EXPANDED_BYTES:
-                    raise expands_too_far(path, len(data), MAX_EXPANDED_BYTES)
+                if len(content) + size > MAX_EXPANDED_FITS_BYTES:
+                    raise expands_too_far(path, len(data), MAX_EXPANDED_FITS_BYTES)
                 content += stream.read(size)
     except ConfigError:
         raise
@@ -146,59 +210,32 @@ def check_pixels(shape: Sequence[int], where: str = "") -> None:
         )
 
 
-def kind_of(data: bytes) -> str | None:
-    """Return the kind of a picture by its first bytes; None if it is none that starcat reads."""
+def _kind_of(data: bytes) -> str | None:
     if data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS:
         return "HEIC"
     return next((kind for start, kind in _KINDS.items() if data.startswith(start)), None)
 
 
-def holds_picture(path: Path) -> bool | None:
-    """Return whether a file is read as a picture, and not as centroids; None if its name decides.
-
-    A FITS file without an image can be a table of centroids, whatever its name, and a gzip file
-    can hold a text.
-    """
-    if path.suffix.lower() in RAW_MAKERS:
-        return True
-    data = _beginning(path)
-    is_packed = data.startswith(GZIP)
-    if is_packed:
-        data = expanded_beginning(data, _BEGINNING_BYTES)
-    if data.startswith(FITS):
-        return _has_image(data, path)
-    return kind_of(data) is not None if is_packed else None
-
-
 _BEGINNING_BYTES = 1 << 16
 
 
-def _beginning(path: Path) -> bytes:
-    """Return the first bytes of a regular file; none if it cannot be read, which readers report."""
-    try:
-        check_regular_file(path)
-        with path.open("rb") as file:
-            return file.read(_BEGINNING_BYTES)
-    except (OSError, ValueError, SourceError):
-        return b""
+def _has_image(data: bytes) -> bool:
+    """Return whether a FITS file is a picture, and not a table of centroids, whatever its name.
 
-
-def _has_image(beginning: bytes, path: Path) -> bool:
-    """Return whether a FITS file has an image; True if it is damaged, which its reader reports."""
+    A damaged file is one, so that the reader of pictures reports the damage.
+    """
     from astropy.io import fits
 
     try:
         with warnings.catch_warnings(action="ignore"):
-            header = fits.Header.fromstring(beginning.decode("latin-1"))
+            header = fits.Header.fromstring(data[:_BEGINNING_BYTES].decode("latin-1"))
             if min(_shape_of(header), default=0) > 0:
                 return True  # in the first part, as in most files
-            with fits.open(io.BytesIO(unpacked(path)), memmap=False) as parts:
+            with fits.open(io.BytesIO(data), memmap=False) as parts:
                 has_image = any(
                     part.is_image and len(part.shape) >= 2 and min(part.shape) > 0 for part in parts
                 )
                 return has_image or not any(map(is_table, parts))
-    except ConfigError:
-        raise
     except Exception:
         return True
 
