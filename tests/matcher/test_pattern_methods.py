@@ -49,6 +49,17 @@ def rank_by_cells(observation, sky, reference, most=64):
     return product["star"][rows], votes
 
 
+@pytest.mark.parametrize("most", [1, 5, 20, 64])
+def test_of_rows_with_equal_votes_the_smaller_ones_come_first(sky, most):
+    """Whatever their number is, so that the processor's way of sorting decides nothing."""
+    observation, reference, _ = centred_on(sky, 100, 30.0)
+    all_stars, all_votes = rank_by_cells(observation, sky, reference, len(sky.mag))
+    stars, votes = rank_by_cells(observation, sky, reference, most)
+    assert stars.tolist() == all_stars[:most].tolist()
+    assert votes.tolist() == all_votes[:most].tolist()
+    assert (np.diff(all_votes) == 0).sum() > 100
+
+
 RANK = {"dynamic_angle": rank_by_angles, "grid": rank_by_cells, "radial": rank_by_rings}
 
 

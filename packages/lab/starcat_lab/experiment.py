@@ -23,7 +23,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import starcat
-from starcat.catalog.stars import floats_of
+from starcat.catalog.stars import NO_STARS, floats_of
 from starcat.database import open_database_folder
 from starcat.geometry import (
     Camera,
@@ -229,19 +229,22 @@ def sky_of_database(folder: Path) -> Sky:
 
 
 def catalog_of_database(folder: Path) -> Sky:
-    """Return the whole catalog of a database."""
+    """Return the whole catalog of a database: its guide stars and the stars that were rejected."""
     database = open_database_folder(folder)
     stars, rejected = database.table("stars"), database.table("rejected")
     # A merged star's companion is in the guide star already.
-    there = pc.and_(pc.is_valid(rejected["ra_deg"]), pc.is_valid(rejected["mag"]))
-    tables = (stars, rejected.filter(pc.and_(there, pc.not_equal(rejected["reason"], "merged"))))
+    elsewhere = pa.array(["merged", *(reason.name for reason in NO_STARS)])
+    is_known = pc.and_(pc.is_valid(rejected["ra_deg"]), pc.is_valid(rejected["mag"]))
+    is_star = pc.and_not(is_known, pc.is_in(rejected["reason"], elsewhere))
+    tables = (stars, rejected.filter(is_star))
     ra_deg, dec_deg, mag = (
         np.concatenate([floats_of(table, name) for table in tables])
         for name in ("ra_deg", "dec_deg", "mag")
     )
     index = np.full(len(mag), -1, dtype=np.int32)
     index[: len(stars)] = np.arange(len(stars))
-    order = np.argsort(np.concatenate([table["star_id"].to_numpy() for table in tables]))
+    star_id = np.concatenate([table["star_id"].to_numpy() for table in tables])
+    order = np.argsort(star_id, kind="stable")
     u = directions_from_radec(ra_deg, dec_deg)
     return Sky(u[order], mag[order], index[order])
 

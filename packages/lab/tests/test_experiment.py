@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
 
 from starcat.catalog.stars.region import Region
+from starcat.database import open_database_folder
 from starcat.geometry.camera import Camera
 from starcat.matcher.c_engine import library_version
+from starcat.pipeline.build import build
 from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
-from starcat_lab.experiment import Attitudes, Experiment, attitude_of, description, run_experiment
+from starcat.pipeline.specs.reading import spec_from_dict
+from starcat_lab.experiment import (
+    Attitudes,
+    Experiment,
+    attitude_of,
+    catalog_of_database,
+    description,
+    run_experiment,
+)
 from starcat_lab.papers import s2, s4
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
@@ -48,6 +59,21 @@ def test_the_installed_engine_answers_as_numpy_does(small_database, tmp_path):
     facts = json.loads(description(installed, small_database))
     assert facts["c_library"] == library_version()
     assert "c_library" not in json.loads(description(numpy, small_database))
+
+
+def test_the_sky_of_a_database_has_each_star_once(small_spec, sao_lines, tmp_path):
+    """Also a star with two records, of which one is rejected."""
+    lines = b"".join([*sao_lines, *sao_lines[:5]])
+    (tmp_path / "sao.dat").write_bytes(lines)
+    spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
+    folder = build(spec, tmp_path / "dist", inputs={"sao": [tmp_path / "sao.dat"]}).folder
+    rejected = open_database_folder(folder).table("rejected")
+    assert rejected["reason"].to_pylist().count("duplicate_record") == 5
+    sky = catalog_of_database(folder)
+    assert len(np.unique(sky.directions, axis=0)) == len(sky)
+    assert len(sky) == open_database_folder(folder).table("stars").num_rows + sum(
+        reason != "duplicate_record" for reason in rejected["reason"].to_pylist()
+    )
 
 
 def test_random_boresights_are_in_the_region_of_a_database():

@@ -42,6 +42,19 @@ class Reason(Enum):
     uncertain_magnitude = "the magnitude may be wrong by more than 0.3 mag"
 
 
+NO_STARS = frozenset(
+    {
+        Reason.deleted,
+        Reason.duplicate_record,
+        Reason.counterpart,
+        Reason.ambiguous_counterpart,
+        Reason.minor_planet,
+        Reason.artifact,
+    }
+)
+"""Reasons of records that are no star of the sky: another record has it, or there is none."""
+
+
 class NamedReason(Protocol):
     """A reason of an archive or of a rule."""
 

@@ -338,7 +338,7 @@ def _draw_profile(axes: Axes, calibration: Calibration, residual_px: Array, name
     axes.axhline(0.0, color="#333", lw=0.8)
     axes.plot(radius, residual_px, ".", color=_GREY, ms=3)
     inside = np.abs(residual_px) <= limit
-    order = np.flatnonzero(inside)[np.argsort(radius[inside])]
+    order = np.flatnonzero(inside)[np.argsort(radius[inside], kind="stable")]
     for stars in np.array_split(order, min(_BINS, max(1, len(order) // 5))):
         error = residual_px[stars].std() / np.sqrt(len(stars))
         axes.errorbar(

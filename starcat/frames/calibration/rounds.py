@@ -167,7 +167,8 @@ def identify_part(
         rows = np.flatnonzero(middle.contains(px))
         if few is not None:
             away = np.hypot(*(px[rows] - 0.5 * np.array([middle.width_px, middle.height_px])).T)
-            rows = np.sort(rows[np.argsort(away if frame.mag is None else frame.mag[rows])[:few]])
+            key = away if frame.mag is None else frame.mag[rows]
+            rows = np.sort(rows[np.argsort(key, kind="stable")[:few]])
         mag = None if frame.mag is None else frame.mag[rows]
         result = matcher.identify(px[rows], middle, mag=mag, fov_error=fov_error)
         results.append(_of_all(result, rows, len(px)))

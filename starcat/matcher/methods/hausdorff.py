@@ -353,8 +353,10 @@ def lowest(scores: Array, count: int) -> tuple[Rows, Array]:
     if scores.shape[1] < count:
         rest = ((0, 0), (0, count - scores.shape[1]))
         scores = np.pad(scores, rest, constant_values=np.inf)
-    star = np.argpartition(scores, count - 1, axis=1)[:, :count]
+    limit = np.partition(scores, count - 1, axis=1)[:, count - 1 : count]
+    star = np.empty((len(scores), count), dtype=np.intp)
+    for row, (of_row, is_low) in enumerate(zip(scores, scores <= limit, strict=True)):
+        low = np.flatnonzero(is_low)  # more than `count` if several are equal: the first are kept
+        star[row] = low[np.argsort(of_row[low], kind="stable")[:count]]
     score = np.take_along_axis(scores, star, axis=1)
-    order = np.lexsort((star, score))
-    star, score = np.take_along_axis(star, order, axis=1), np.take_along_axis(score, order, axis=1)
     return np.where(np.isinf(score), -1, star), score

@@ -90,10 +90,8 @@ def most_votes(
     offsets = product["cell_offsets"]
     _, entry = rows_between(offsets[cells], offsets[cells + 1])
     votes = np.bincount(product["cell_rows"][entry], minlength=len(product["star"]))
-    most = min(most, len(votes))
-    rows = np.argpartition(-votes, most - 1)[:most]
-    size = product["cells_offsets"][rows + 1] - product["cells_offsets"][rows]
-    rows = rows[np.lexsort((rows, size, -votes[rows]))]
+    size = np.diff(product["cells_offsets"])
+    rows = np.lexsort((size, -votes))[:most]  # stable: the first row of equal ones comes first
     return rows, votes[rows]
 
 
@@ -173,8 +171,7 @@ def rank_by_rings(
     if not len(around):
         return np.zeros(0, dtype=np.intp), np.zeros(0)
     score = _rings_in_common(around, observation.tolerance_rad, product)
-    compared = min(COMPARED * most, len(score))
-    rows = np.argpartition(-score, compared - 1)[:compared]
+    rows = np.argsort(-score, kind="stable")[: COMPARED * most]
     sectors = int(product.numbers["sectors"])
     pattern = sector_pattern(around.position_angle_rad, sectors)
     total = score[rows] - SECTORS * _difference(pattern, product["sector_pattern"][rows], sectors)
