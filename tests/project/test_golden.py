@@ -7,6 +7,8 @@ from golden import GOLDEN, MADE, golden_build, golden_figures
 
 # Sums of up to a million numbers, each right to its last bit or two.
 RELATIVE, ABSOLUTE = 1e-9, 1e-6
+# The circumradius of three stars nearly in line has the errors of their small area.
+RELATIVE_OF = {"circumradius_rad": 1e-7}
 
 
 COUNTS = {
@@ -57,7 +59,8 @@ def check_figures(name, found):
             assert found[product]["sums"][column][0] == count, (product, column)
             if count:
                 got = found[product]["sums"][column][1]
-                assert got == pytest.approx(total, rel=RELATIVE, abs=ABSOLUTE), (product, column)
+                relative = RELATIVE_OF.get(column, RELATIVE)
+                assert got == pytest.approx(total, rel=relative, abs=ABSOLUTE), (product, column)
         for row, before in zip(found[product]["first_rows"], figures["first_rows"], strict=True):
             for column, value in before.items():
                 if isinstance(value, float):

@@ -134,7 +134,9 @@ def test_bias_of_three_sensors_is_within_5_percent_of_closed_forms(bias, bench_o
     records = [trials.point(bench, trial, number) for number in range(trial.pointings)]
     errors = [one["error"][0] for one in records if one["right"][0]]
     assert len(errors) == trial.pointings
-    assert np.mean(errors, axis=0) == pytest.approx(expected_bias(bench), rel=0.05)
+    # Not the mean: a star that the border cuts, or two in one window, can be off by half a pixel,
+    # which is a hundred times the noise of this sensor.
+    assert np.median(errors, axis=0) == pytest.approx(expected_bias(bench), rel=0.05)
 
 
 def test_each_contributor_is_nothing_where_the_sensor_knows_all(bench_of):
