@@ -115,6 +115,9 @@ def read_frame_file(path: Path, options: IdentifyOptions, local: LocalInputs) ->
 
 def _image(content: Content, options: IdentifyOptions, local: LocalInputs) -> NDArray[Any]:
     """Return an image without its dark frame, mosaic and dead pixels, as far as they are stated."""
+    # What detects the stars is loaded before the image takes memory, because OpenBLAS tries for
+    # minutes to start without memory.
+    import starcat.frames.images.centroiding  # noqa: F401
     from starcat.frames.images.image_file import (
         grey_of_mosaic,
         image_of_content,
