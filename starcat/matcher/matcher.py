@@ -166,6 +166,19 @@ class Matcher:
         """
         return Matcher(self.database, self.settings, **options)
 
+    def for_many_frames(self) -> Matcher:
+        """Return the matcher that identifies many frames soonest.
+
+        It uses the C library, if that is possible, also with a database of which an image takes
+        longer to make than a frame takes without it.
+        """
+        settings = self.settings
+        if settings.engine != "auto" or not has_default_search(settings):
+            return self
+        if c_engine(self.database, settings.method) is None:
+            return self
+        return self.with_settings(engine="c")
+
     def identify(
         self,
         centroids_px: FrameLike,

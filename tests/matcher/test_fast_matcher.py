@@ -48,6 +48,18 @@ def both(
     )
 
 
+def test_many_frames_are_identified_in_c_also_with_more_features(sky, monkeypatch):
+    monkeypatch.setattr(c_engine, "MAX_FEATURES", 0)
+    of_one = Matcher(replace(sky, star_id=sky.star_id.copy()))  # nothing is kept of another test
+    assert of_one._c_engine is None
+    of_many = of_one.for_many_frames()
+    assert of_many.settings.engine == "c"
+    for frame in frames(sky, 5, HARD, seed=12):
+        assert_same(of_many.identify(frame), of_one.identify(frame))
+    stated = Matcher(sky, engine="numpy")
+    assert stated.for_many_frames() is stated
+
+
 # --- The same stars
 
 

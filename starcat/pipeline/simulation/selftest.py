@@ -100,6 +100,7 @@ def self_test(
 
     ``part`` is the part of the sphere that the database is for; default: all of it.
     """
+    matcher = matcher.for_many_frames()
     kinds = {"clean": Noise(noise_px), "hard": Noise(noise_px, **HARD)}  # type: ignore[arg-type]
     bare = frames if without_magnitudes is None else min(frames, without_magnitudes)
     with_mag, without = [], []
