@@ -77,7 +77,7 @@ assert METHODS["nearest"].products == ("pairs",)
 """,
     ),
     "option": Recipe(
-        ("starcat/frames/images/solve_files.py", "starcat/matcher/options.py"),
+        ("starcat/frames/images/measure.py", "starcat/matcher/options.py"),
         ("tests/cli/test_option_ranges.py",),
         "border_px",
         """
