@@ -430,12 +430,15 @@ def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(na
     assert accepted(Matcher(narrow_sky, method="pairs"), frames[:2]) == 0
     by_noise = accepted(Matcher(narrow_sky, method="pairs", noise_px=0.5), frames)
     by_mag = accepted(Matcher(narrow_sky, method="pairs", noise_mag=NOISE_MAG), frames)
-    by_both = accepted(
-        Matcher(narrow_sky, method="pairs", noise_px=0.5, noise_mag=NOISE_MAG), frames
-    )
+    both = Matcher(narrow_sky, method="pairs", noise_px=0.5, noise_mag=NOISE_MAG)
     assert by_noise >= 5
     assert by_mag >= 5
-    assert by_both >= 13  # of two frames the five stars do not determine the corners
+    assert accepted(both, frames) >= 9
+    # In the widest ranges of shapes the five stars of two frames do not determine the corners.
+    calibrated = both.with_settings(camera_error=0.002)
+    assert accepted(calibrated, frames) >= 11
+    # The other four are just above the limit.
+    assert accepted(calibrated.with_settings(max_false_match_probability=3e-9), frames) == 15
 
 
 @pytest.mark.slow
