@@ -189,7 +189,7 @@ typedef struct {
                                             if not 0, it is fitted with the attitude (method
                                             triangle only); 0: it is known */
   starcat_real camera_error; /* largest error of a calibrated camera at the corners, as a share
-                                            of the half diagonal, up to 0.1: it narrows the
+                                            of the half diagonal, 1e-6 to 0.1: it narrows the
                                             shapes that a frame can have; 0: not stated */
   uint32_t max_steps;        /* bound on the work; see starcat_result.steps */
 } starcat_options;

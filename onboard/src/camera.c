@@ -1,4 +1,5 @@
-/* The camera: directions of pixels and back, with Brown's distortion as the ground has it.
+/* The camera: directions of pixels and back, with Brown's distortion as the ground has it, and the
+ * columns of its detector.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -221,4 +222,24 @@ starcat_status starcat_get_camera(const starcat_image *image, starcat_camera *ca
   camera->p2 = R(0.0);
   camera->fold_radius = R(0.0);
   return STARCAT_OK;
+}
+
+/* List the usable centroids by column of the detector. */
+void starcat_list_columns(starcat_call *call) {
+  starcat_workspace *w = call->work;
+  call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;
+  for (uint32_t n = 0; n <= STARCAT_COLUMNS; n++) {
+    w->column[n] = 0;
+  }
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    w->column[starcat_find_column(call, call->x[i])]++;
+  }
+  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* end of each column */
+    w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
+  }
+  for (uint32_t i = call->own->count; i > 0u; i--) { /* begin of each column */
+    const uint32_t n = starcat_find_column(call, call->x[i - 1u]);
+    w->column[n]--;
+    w->in_column[starcat_limit_place(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
+  }
 }

@@ -5,6 +5,7 @@
 #include "internal.h"
 
 #define WIDEST_FOV_ERROR R(0.5)
+#define LEAST_CAMERA_ERROR R(1e-6) /* if it is stated */
 #define MOST_CAMERA_ERROR R(0.1)
 #define MOST_NOISE_MAG R(1e6)
 
@@ -26,10 +27,12 @@ starcat_status starcat_check_options(const starcat_options *o) {
   if (!starcat_are_finite((const real *)(const void *)o, 6)) {
     return STARCAT_E_NOT_FINITE;
   }
-  if (!starcat_is_between(o->noise_px, R(0.0), STARCAT_LARGEST_PX) ||
+  if ((o->noise_px < R(0.0)) ||
       !starcat_is_between(o->noise_mag, R(0.0), MOST_NOISE_MAG) ||
       !starcat_is_between(o->fov_error, R(0.0), WIDEST_FOV_ERROR) ||
-      !starcat_is_between(o->camera_error, R(0.0), MOST_CAMERA_ERROR) || (o->max_steps == 0u) ||
+      !starcat_is_between((o->camera_error != R(0.0)) ? o->camera_error : LEAST_CAMERA_ERROR,
+                          LEAST_CAMERA_ERROR, MOST_CAMERA_ERROR) ||
+      (o->max_steps == 0u) ||
       !starcat_is_between(o->noise_px > R(0.0) ? o->noise_px : o->tolerance_px, STARCAT_LEAST_PX,
                           STARCAT_LARGEST_PX)) {
     return STARCAT_E_OPTIONS;
@@ -115,26 +118,6 @@ static void drop_repeats(const starcat_call *call, starcat_result *result) {
     }
   }
   call->own->count = kept;
-}
-
-/* List the usable centroids by column of the detector. */
-void starcat_list_columns(starcat_call *call) {
-  starcat_workspace *w = call->work;
-  call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;
-  for (uint32_t n = 0; n <= STARCAT_COLUMNS; n++) {
-    w->column[n] = 0;
-  }
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    w->column[starcat_find_column(call, call->x[i])]++;
-  }
-  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* end of each column */
-    w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
-  }
-  for (uint32_t i = call->own->count; i > 0u; i--) { /* begin of each column */
-    const uint32_t n = starcat_find_column(call, call->x[i - 1u]);
-    w->column[n]--;
-    w->in_column[starcat_limit_place(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
-  }
 }
 
 static void set_limits(starcat_call *call, const starcat_options *options) {

@@ -230,12 +230,15 @@ void starcat_allow_scales(starcat_call *call, real fov_error);
 int starcat_find_direction(const starcat_optics *camera, real x_px, real y_px, real body[3]);
 int starcat_find_pixel(const starcat_optics *camera, const real body[3], real *x_px, real *y_px);
 void starcat_find_turns(const starcat_optics *camera, const real body[3], real turn[2][3]);
+void starcat_list_columns(starcat_call *call);
 
 /* sky.c */
 uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], real cos_r,
                               real sin_r, uint32_t most, uint32_t *rows, real (*icrs)[3]);
 
 /* ways.c */
+uint32_t starcat_find_deviation(const starcat_call *call, uint32_t centroid, uint32_t row);
+int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
 void starcat_count_ways(const starcat_call *call, uint32_t most);
 
 /* chance.c */
@@ -266,8 +269,6 @@ real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx
                             real weight, starcat_step *step);
 
 /* verify.c */
-uint32_t starcat_find_deviation(const starcat_call *call, uint32_t centroid, uint32_t row);
-int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
 uint32_t starcat_count_fewer(const starcat_call *call);
 int starcat_spend_on_bound(const starcat_call *call);
 real starcat_find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
@@ -283,7 +284,6 @@ void starcat_search_near(starcat_call *call, const real m[9], real uncertainty_r
 
 /* frame.c */
 starcat_status starcat_check_options(const starcat_options *o);
-void starcat_list_columns(starcat_call *call);
 starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image,
                                   const starcat_camera *camera, const starcat_options *options,
                                   const starcat_frame *frame, starcat_workspace *work,

@@ -31,27 +31,6 @@
 #define DOUBLED_FOR_SHAPE 2u   /* the same to fit a shape */
 #define FREE_TERMS 4u          /* with which the stars of an answer must determine the boresight */
 
-/* By how many whole deviations the magnitudes of a centroid and a star differ. Without a stated noise
- * of places, which is their unit, it is 0, or STARCAT_INCOMPATIBLE. */
-uint32_t starcat_find_deviation(const starcat_call *call, uint32_t centroid, uint32_t row) {
-  const real observed = call->work->magnitude[centroid];
-  const int16_t stored = call->image->magnitudes[starcat_limit_place(row, call->image->n_stars)];
-  if (!(call->noise_mag > R(0.0)) || (stored == INT16_MIN) ||
-      !(observed < STARCAT_UNKNOWN_MAGNITUDE)) {
-    return 0;
-  }
-  const real apart = starcat_absolute(observed - R(0.001) * (real)stored);
-  if (!(apart <= STARCAT_MAG_DEVIATIONS * call->noise_mag)) {
-    return STARCAT_INCOMPATIBLE;
-  }
-  return call->noise_px > R(0.0) ? (uint32_t)(apart / call->noise_mag) : 0u;
-}
-
-/* Whether the magnitudes of a centroid and a star are compatible. */
-int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
-  return starcat_find_deviation(call, centroid, row) < STARCAT_INCOMPATIBLE;
-}
-
 /* Project the stars around the field on the detector; keep stars within a margin of it. */
 void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px) {
   starcat_workspace *w = call->work;

@@ -24,6 +24,27 @@ static real root_of_factorial(uint32_t n) {
   return n > 0u ? starcat_exponential(starcat_log_factorial(n) / (real)n) : R(0.0);
 }
 
+/* By how many whole deviations the magnitudes of a centroid and a star differ. Without a stated noise
+ * of places, which is their unit, it is 0, or STARCAT_INCOMPATIBLE. */
+uint32_t starcat_find_deviation(const starcat_call *call, uint32_t centroid, uint32_t row) {
+  const real observed = call->work->magnitude[centroid];
+  const int16_t stored = call->image->magnitudes[starcat_limit_place(row, call->image->n_stars)];
+  if (!(call->noise_mag > R(0.0)) || (stored == INT16_MIN) ||
+      !(observed < STARCAT_UNKNOWN_MAGNITUDE)) {
+    return 0;
+  }
+  const real apart = starcat_absolute(observed - R(0.001) * (real)stored);
+  if (!(apart <= STARCAT_MAG_DEVIATIONS * call->noise_mag)) {
+    return STARCAT_INCOMPATIBLE;
+  }
+  return call->noise_px > R(0.0) ? (uint32_t)(apart / call->noise_mag) : 0u;
+}
+
+/* Whether the magnitudes of a centroid and a star are compatible. */
+int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
+  return starcat_find_deviation(call, centroid, row) < STARCAT_INCOMPATIBLE;
+}
+
 /* The sums of the weights exp(-d^2 / 3) of the partners that a centroid or a star can have, d whole
  * deviations apart: as they are, and in the terms of Bregman's theorem, of those that are d apart at
  * most, times what the weight falls from d to d + 1. */

@@ -86,6 +86,7 @@ static void check_options(const starcat_frame *frame, const starcat_real q[4]) {
   CHECK_IS(with_option(&o->fov_error, (starcat_real)0.51, frame, q), STARCAT_E_OPTIONS);
   CHECK_IS(with_option(&o->camera_error, (starcat_real)-0.01, frame, q), STARCAT_E_OPTIONS);
   CHECK_IS(with_option(&o->camera_error, (starcat_real)0.11, frame, q), STARCAT_E_OPTIONS);
+  CHECK_IS(with_option(&o->camera_error, (starcat_real)9e-7, frame, q), STARCAT_E_OPTIONS);
   o->max_steps = 0;
   CHECK_IS(identify(&unit_scratch, frame), STARCAT_E_OPTIONS);
   CHECK_IS(track(&unit_scratch, frame, q, PRIOR_RAD), STARCAT_E_OPTIONS);
