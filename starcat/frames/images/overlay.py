@@ -29,6 +29,7 @@ LETTER_PT = 0.62 * LABEL_PT  # size of names, and about the width of a letter
 _MAX_LABELS = 60
 _LABEL_GAP_PT = 4.0
 _COMPASS_PT = 76.0
+_SHADES = 32  # of a picture between black and white
 # Layers of a spot: their sizes and opacities.
 _GLOW = ((3.2, 0.06), (2.2, 0.10), (1.5, 0.18), (1.0, 1.0))
 
@@ -71,8 +72,8 @@ def mark_radii(count: int, mag: Array | None) -> Array:
     return np.asarray(5.0 + 5.0 * np.nan_to_num(part))
 
 
-def draw_sky(frame: FrameAxes, image: NDArray[Any] | None) -> None:
-    """Draw the sky."""
+def draw_sky(frame: FrameAxes, image: NDArray[Any] | None, *, is_scaled_later: bool) -> None:
+    """Draw the sky; an image that is scaled when it is shown, as in SVG, keeps its pixels."""
     from matplotlib.colors import LinearSegmentedColormap
 
     width, height = frame.size
@@ -85,7 +86,12 @@ def draw_sky(frame: FrameAxes, image: NDArray[Any] | None) -> None:
         return
     colours = LinearSegmentedColormap.from_list("sky", [SKY, "#8b97ad", "#ffffff"])
     extent = (0.0, float(width), float(height), 0.0)
-    frame.axes.imshow(stretch(image), colours, vmin=0.0, vmax=1.0, extent=extent, aspect="auto")
+    # The noise of a picture hides the steps between so few shades, and they halve its file.
+    shown = np.round(stretch(image) * _SHADES) / _SHADES
+    frame.axes.imshow(
+        shown, colours, vmin=0.0, vmax=1.0, extent=extent, aspect="auto",
+        interpolation="none" if is_scaled_later else None,
+    )  # fmt: skip
 
 
 def draw_marks(frame: FrameAxes) -> None:

@@ -213,7 +213,7 @@ def draw_identified(
         figure, axes, scale = _canvas(camera_size, title, below)
         radii = mark_radii(len(names), mag)
         frame = FrameAxes(axes, scale, camera_size, centroids_px, shown, radii, is_placed)
-        draw_sky(frame, image)
+        draw_sky(frame, image, is_scaled_later=path is not None and path.suffix.lower() == ".svg")
         written = draw_overlay(frame, overlay or Overlay())
         draw_marks(frame)
         taken = draw_compass(frame, compass)
