@@ -174,8 +174,8 @@ static void tell_errors_of_shape(const starcat_call *call, uint32_t n_seen, real
 
 /* Compute the covariance of the attitude, A^-1 sum(w^2 t t') A^-1 with the rotations t that the
  * noise of each centroid causes, and the reduced chi-square. Returns 0 if the stars are farther from
- * where the attitude puts them than the largest error of a centroid, on average: a bit must have
- * flipped since they agreed. */
+ * where the attitude puts them than the reach, on average: each agreed within the reach, so that a bit
+ * must have flipped since. */
 static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result *result) {
   const starcat_workspace *w = call->work;
   real h[6] = {0}, s[3][3] = {{0}, {0}, {0}}, unused[3], inverse[6];
@@ -187,7 +187,7 @@ static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result
   unknowns = w->best.free > 0u ? 3u + w->best.free : unknowns;
   const uint32_t n_free = 2u * n_seen > unknowns ? 2u * n_seen - unknowns : 1u;
   const real unstated = find_unstated(squared.px, n_free);
-  if (!(squared.px <= (real)n_seen * call->tolerance_px * call->tolerance_px)) {
+  if (!(squared.px <= (real)n_seen * call->reach_px * call->reach_px)) {
     return 0;
   }
   if (2u * squared.n_stated > unknowns) {
