@@ -4,6 +4,8 @@
  */
 #include "internal.h"
 
+#define FARTHEST R(1.5) /* in reaches: a star that agreed within one, after the last fit */
+
 /* Fill in the reason for no answer, and the quality of the best agreement, whose attitude can be in
  * the result already. */
 static starcat_status refuse_frame(const starcat_call *call, starcat_result *result) {
@@ -102,7 +104,7 @@ typedef struct {
   real px;     /* square pixels */
   real stated; /* those of stated noise, in units of it */
   real all;    /* in units of the noise, stated or what the tolerance stands for */
-  uint32_t n_stated;
+  uint32_t n_stated, n_far; /* stars with a stated noise, and farther than any that agreed */
 } residual_sums;
 
 static void sum_residuals(const starcat_call *call, const real m[9], uint32_t n_seen, real left,
@@ -117,6 +119,7 @@ static void sum_residuals(const starcat_call *call, const real m[9], uint32_t n_
     const real dx = call->x[i] - x, dy = call->y[i] - y;
     const real square = dx * dx + dy * dy, sigma = left * starcat_find_sigma(call, i);
     s->px += square;
+    s->n_far += square <= FARTHEST * FARTHEST * call->reach_px * call->reach_px ? 0u : 1u;
     s->all += square / (sigma * sigma);
     if (noise > R(0.0)) {
       s->stated += square / (noise * noise);
@@ -173,13 +176,13 @@ static void tell_errors_of_shape(const starcat_call *call, uint32_t n_seen, real
 }
 
 /* Compute the covariance of the attitude, A^-1 sum(w^2 t t') A^-1 with the rotations t that the
- * noise of each centroid causes, and the reduced chi-square. Returns 0 if the stars are farther from
- * where the attitude puts them than the reach, on average: each agreed within the reach, so that a bit
- * must have flipped since. */
+ * noise of each centroid causes, and the reduced chi-square. Returns 0 if a star is much farther from
+ * where the attitude puts it than the reach: it agreed within the reach, so that a bit must have
+ * flipped since. */
 static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result *result) {
   const starcat_workspace *w = call->work;
   real h[6] = {0}, s[3][3] = {{0}, {0}, {0}}, unused[3], inverse[6];
-  residual_sums squared = {R(0.0), R(0.0), R(0.0), 0};
+  residual_sums squared = {R(0.0), R(0.0), R(0.0), 0, 0};
   /* Noise is stated in pixels of the frame; its scale is undone in the places. */
   const real left = w->best.free > 0u ? R(1.0) - w->best.terms[0] : R(1.0);
   sum_residuals(call, result->matrix, n_seen, left, &squared);
@@ -187,7 +190,7 @@ static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result
   unknowns = w->best.free > 0u ? 3u + w->best.free : unknowns;
   const uint32_t n_free = 2u * n_seen > unknowns ? 2u * n_seen - unknowns : 1u;
   const real unstated = find_unstated(squared.px, n_free);
-  if (!(squared.px <= (real)n_seen * call->reach_px * call->reach_px)) {
+  if (squared.n_far > 0u) {
     return 0;
   }
   if (2u * squared.n_stated > unknowns) {
