@@ -4,7 +4,7 @@
  */
 #include "internal.h"
 
-#define FARTHEST R(1.5) /* in reaches: a star that agreed within one, after the last fit */
+#define FARTHEST_STAR R(1.5) /* in reaches: a star that agreed within one, after the last fit */
 
 /* Fill in the reason for no answer, and the quality of the best agreement, whose attitude can be in
  * the result already. */
@@ -119,7 +119,7 @@ static void sum_residuals(const starcat_call *call, const real m[9], uint32_t n_
     const real dx = call->x[i] - x, dy = call->y[i] - y;
     const real square = dx * dx + dy * dy, sigma = left * starcat_find_sigma(call, i);
     s->px += square;
-    s->n_far += square <= FARTHEST * FARTHEST * call->reach_px * call->reach_px ? 0u : 1u;
+    s->n_far += square <= FARTHEST_STAR * FARTHEST_STAR * call->reach_px * call->reach_px ? 0u : 1u;
     s->all += square / (sigma * sigma);
     if (noise > R(0.0)) {
       s->stated += square / (noise * noise);
