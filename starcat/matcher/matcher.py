@@ -169,8 +169,11 @@ class Matcher:
     def for_many_frames(self) -> Matcher:
         """Return the matcher that identifies many frames soonest.
 
-        It uses the C library, if that is possible, also with a database of which an image takes
-        longer to make than a frame takes without it.
+        Returns
+        -------
+        Matcher
+            In C, if that is possible, also where making the image that C reads takes longer than
+            a frame in numpy; this matcher if an engine is chosen already.
         """
         settings = self.settings
         if settings.engine != "auto" or not has_default_search(settings):

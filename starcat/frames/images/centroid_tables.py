@@ -16,7 +16,7 @@ import numpy as np
 
 from starcat.arguments import columns_of
 from starcat.errors import ConfigError
-from starcat.frames.images.contents import FITS, Content, is_table
+from starcat.frames.images.contents import FITS, FileContent, is_table
 from starcat.matcher.centroid_columns import EXPECTED, choose_columns, listed
 from starcat.matcher.centroids import (
     MAX_EXPANDED_BYTES,
@@ -30,7 +30,7 @@ _PARQUET, _XML = b"PAR1", (b"<?xml", b"<VOTABLE")
 Table = Mapping[str, Any]
 
 
-def frames_of_content(content: Content) -> list[MeasuredFrame]:
+def frames_of_content(content: FileContent) -> list[MeasuredFrame]:
     """Return the frames of a file of centroids of any format."""
     data, path = content.data, content.path
     if data.startswith(FITS):

@@ -70,7 +70,7 @@ RAW_PICTURE = "a raw picture"
 
 
 @dataclass(frozen=True, eq=False)
-class Content:
+class FileContent:
     """The content of a file of frames, expanded if it is in gzip."""
 
     path: Path
@@ -97,7 +97,7 @@ class Content:
         return True
 
 
-def read_content(path: Path, expected: str = CENTROIDS_OR_IMAGE) -> Content:
+def read_content(path: Path, expected: str = CENTROIDS_OR_IMAGE) -> FileContent:
     """Read a file of frames.
 
     Parameters
@@ -119,19 +119,19 @@ def read_content(path: Path, expected: str = CENTROIDS_OR_IMAGE) -> Content:
     except SourceError as error:
         raise ConfigError(f"{error}; expected {expected}") from error
     if not data.startswith(GZIP):
-        content = Content(path, data)
+        content = FileContent(path, data)
         if len(data) > MAX_BYTES and not content.is_picture:
             raise ConfigError(f"has more than {MAX_BYTES:,} bytes of centroids", where=path)
         return content
     beginning = expanded_beginning(data, _SIGNATURE_BYTES)
     if beginning.startswith(FITS):
-        content = Content(path, _expanded_fits(data, path))
+        content = FileContent(path, _expanded_fits(data, path))
         if len(content.data) > MAX_EXPANDED_BYTES and not content.is_picture:
             raise expands_too_far(path, len(data), MAX_EXPANDED_BYTES)
         return content
-    is_picture = Content(path, beginning).is_picture
+    is_picture = FileContent(path, beginning).is_picture
     limit = MAX_EXPANDED_PICTURE_BYTES if is_picture else MAX_EXPANDED_BYTES
-    return Content(path, expanded(data, limit, path))
+    return FileContent(path, expanded(data, limit, path))
 
 
 def _expanded_fits(data: bytes, path: Path) -> bytes:

@@ -33,7 +33,7 @@ from starcat.frames.images.contents import (
     MAX_EXPANDED_FITS_BYTES,
     MAX_PIXELS,
     RAW_PICTURE,
-    Content,
+    FileContent,
     check_pixels,
     read_content,
 )
@@ -80,7 +80,7 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
 
 
 def image_of_content(
-    content: Content, *, flip: bool | None = None, plane: int | None = None
+    content: FileContent, *, flip: bool | None = None, plane: int | None = None
 ) -> Grey:
     """Return the grey values of the content of an image, as `read_image` does."""
     path, data, kind = content.path, content.data, content.kind

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.frames.images.centroid_tables import frames_of_content
-from starcat.frames.images.contents import Content, read_content
+from starcat.frames.images.contents import FileContent, read_content
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroids import MeasuredFrame, read_stdin
 from starcat.matcher.options import IdentifyOptions
@@ -113,7 +113,7 @@ def read_frame_file(path: Path, options: IdentifyOptions, local: LocalInputs) ->
     return FrameFile(path, image=_image(content, options, local))
 
 
-def _image(content: Content, options: IdentifyOptions, local: LocalInputs) -> NDArray[Any]:
+def _image(content: FileContent, options: IdentifyOptions, local: LocalInputs) -> NDArray[Any]:
     """Return an image without its dark frame, mosaic and dead pixels, as far as they are stated."""
     # What detects the stars is loaded before the image takes memory, because OpenBLAS tries for
     # minutes to start without memory.

@@ -208,10 +208,9 @@ class FileAnswers:
     @cached_property
     def _image(self) -> NDArray[Any] | None:
         """The image, read again if it was not kept; None for centroids."""
-        image = self.measured.image
-        return (
-            read_frame_file(self.path, self.options, self.local).image if image is None else image
-        )
+        if self.measured.image is not None:
+            return self.measured.image
+        return read_frame_file(self.path, self.options, self.local).image
 
     @cached_property
     def _observer(self) -> Observer | None:
