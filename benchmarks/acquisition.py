@@ -16,8 +16,9 @@ processor time of a call from Python, with the attitude and the star numbers rea
 
 With ``--sequences`` only sequences of three frames, 1 s apart, are identified by a `Tracker`. The
 camera turns at a constant rate of up to 0.8 deg/s, and the noise is stated. A sequence ends with
-its first answer. A fourth of the sequences without a sky, and of those with priors that are wrong
-by 3 deg where 1 deg is allowed, is made in addition: none of them may have a wrong answer.
+its first answer. A fourth of the sequences without a sky, of those that lose the sky after their
+first frame, and of those with priors that are wrong by 3 deg where 1 deg is allowed, is made in
+addition: none of them may have a wrong answer.
 
 The lens of these frames is exactly the stated one. ``--camera-error`` states that it is calibrated.
 """
@@ -139,9 +140,10 @@ def try_sequences(
     scene, ended = Scene(stars, stars, kind.noise_px), Counter[str]()
     for attitude in random_attitudes(count, generator):
         tracker, end = Tracker(matcher, max_turn_deg=MAX_TURN_DEG), "none"
-        for frame, given in made_sequence(stars, sky, kind, what, attitude, generator):
+        frames = made_sequence(stars, sky, kind, what, attitude, generator)
+        for number, (frame, given) in enumerate(frames):
             found = tracker.identify(frame.centroids_px, mag=frame.mag, **given)
-            truths = () if what == "no sky" else (frame.matrix,)
+            truths = (frame.matrix,) if _has_sky(what, number) else ()
             trial = Trial(frame.centroids_px, frame.mag, truths, noise_px=kind.noise_px)
             verdict = judge_answer(found, trial, scene, matcher.settings.tolerance_px)
             if verdict is not None:
@@ -166,9 +168,9 @@ def made_sequence(
     """
     rate, q = _turn(generator, RATE_DEG * generator.uniform()), quaternion_from_matrix(attitude)
     made, given = [], {}
-    for _ in range(FRAMES_OF_SEQUENCE):
+    for number in range(FRAMES_OF_SEQUENCE):
         frame = made_frame(stars, sky, kind, matrix_from_quaternion(q), generator)
-        if what == "no sky":
+        if not _has_sky(what, number):
             size_px = np.array([stars.camera.width_px, stars.camera.height_px])
             places_px = generator.uniform(0.0, 1.0, frame.centroids_px.shape) * size_px
             frame = replace(frame, centroids_px=places_px)
@@ -180,6 +182,10 @@ def made_sequence(
     return made
 
 
+def _has_sky(what: str, number: int) -> bool:
+    return what != "no sky" and (what != "sky lost" or number == 0)
+
+
 def _turn(generator: np.random.Generator, angle_deg: float) -> Turn:
     x, y, z = generator.normal(size=3)
     scale = np.radians(angle_deg) / np.sqrt(x * x + y * y + z * z)
@@ -189,7 +195,7 @@ def _turn(generator: np.random.Generator, angle_deg: float) -> Turn:
 def print_sequences(database: Path, count: int, calibrated: dict[str, float], rows: Rows) -> None:
     """Print how sequences of three frames ended."""
     print(f"{'':31}  right  alone  confirmed  wrong  none")
-    for what in ("sky", "no sky", "wrong prior"):
+    for what in ("sky", "no sky", "sky lost", "wrong prior"):
         for kind in KINDS:
             number = count if what == "sky" else max(1, count // 4)
             ended = try_sequences(database, kind, what, number, calibrated)

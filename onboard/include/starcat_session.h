@@ -52,7 +52,7 @@ typedef enum {
   STARCAT_MODE_NONE = 0,     /* not answered: no image can be used */
   STARCAT_MODE_IDENTIFY = 1, /* lost in space */
   STARCAT_MODE_TRACK = 2,    /* near the last attitude */
-  STARCAT_MODE_CONFIRM = 3   /* by the candidates of the refused frames before it */
+  STARCAT_MODE_CONFIRM = 3   /* together with the refused frames before it */
 } starcat_mode;
 
 /* State of the load of a new image or patch. */
@@ -116,7 +116,7 @@ typedef struct {
   uint32_t max_steps_confirm; /* and of confirming a refused frame by the frames before it; 0: off.
                                * All three together bound a frame */
   /* Largest error of the last attitude as prior, up to 0.35; attitudes of this age or older are not
-   * used, 0: no tracking. Both hold for candidates, too. */
+   * used, 0: no tracking. Both hold for the turn and the time between refused frames, too. */
   starcat_real prior_error_rad;
   uint64_t prior_age;
   uint32_t blocks_per_tick;     /* work of a tick of idle time, in blocks; 0: no idle work */
@@ -161,19 +161,15 @@ typedef struct {
   uint32_t stores_failed; /* how often settings.store failed; idle time repeats it */
 } starcat_counts;
 
-/* Candidates of successive frames that agree with each other. */
+/* Spots of successive frames without an answer, in the camera frame of the last one. */
 typedef struct {
-  starcat_real q[4];       /* attitude of the last candidate, and the time of its frame */
-  uint64_t time;
-  starcat_real square_px;  /* squared residuals of the spots that are evidence */
-  starcat_real log_number; /* logarithm of the expected number of agreements, except the residuals */
-  uint32_t left;           /* degrees of freedom of the residuals */
-  uint32_t n_spots;        /* spots of all frames; 0: there is no chain */
-  uint32_t first;          /* number of the first frame */
-  uint32_t crc;            /* of the chain and its spots */
-} starcat_chain;
-
-#define STARCAT_CHAIN_SPOTS (2u * STARCAT_MAX_CENTROIDS)
+  uint64_t time; /* of the last frame */
+  uint32_t n_spots;
+  uint16_t seen[STARCAT_MAX_CENTROIDS]; /* frames that have the spot; 0: one, but not the last one */
+  starcat_real magnitude[STARCAT_MAX_CENTROIDS];
+  starcat_real body[STARCAT_MAX_CENTROIDS][3];
+  uint32_t crc; /* of the members above */
+} starcat_composite;
 
 typedef struct {
   const starcat_settings *settings; /* null: not prepared */
@@ -206,9 +202,7 @@ typedef struct {
   uint32_t suspect, member;        /* 1: blocks of the group are checked, from `member` on, as its
                                       parity differs */
   starcat_patching patching;
-  uint32_t n_frames; /* number of the last frame */
-  starcat_chain chain;
-  starcat_real spots[STARCAT_CHAIN_SPOTS + STARCAT_MAX_CENTROIDS][3]; /* of the chain, on the sky */
+  starcat_composite composite;
   starcat_real x_px[STARCAT_MAX_CENTROIDS];
   starcat_real y_px[STARCAT_MAX_CENTROIDS];
   starcat_workspace workspace;
@@ -247,12 +241,13 @@ starcat_status starcat_test_self(starcat_session *session, starcat_answer *answe
 /* Identify a frame. If the last attitude is fresh at `time`, the frame is tracked first; if it is
  * not, or if tracking fails, the frame is identified lost in space. With `correct` the attitude is
  * fitted to corrected centroids. An attitude that is found becomes the last attitude. A frame
- * without one changes only counts and the chain of candidates: the last attitude is used until its
+ * without one changes only counts and the composite of such frames: the last attitude is used until its
  * age ends it. Without an image: why there is none, and STARCAT_MODE_NONE.
  *
- * With max_steps_confirm a refused frame's candidate is kept, with its spots. If a later frame has a
- * candidate within prior_error_rad of it, and before prior_age, both are answered if the bound of
- * both together, by the spots that are new, is below options.log_chance. fov_error has to be 0. */
+ * With max_steps_confirm the spots of refused frames are put together, if each frame follows the one
+ * before it within prior_age, and by a turn of at most prior_error_rad. If they have an attitude
+ * together, and the last frame has one near it, that frame is answered. Its log_chance is the larger
+ * one of both. fov_error has to be 0. */
 starcat_status starcat_answer_frame(starcat_session *session, const starcat_frame *frame,
                                     uint64_t time, starcat_answer *answer);
 

@@ -4,23 +4,29 @@
  */
 #include "internal.h"
 
-/* The attitude that rotates a1 exactly into b1, and a2 into the plane of b1 and b2 (TRIAD; Black
- * 1964). Returns 0 if two directions coincide. */
+/* The attitude that rotates a1 to b1 and a2 to b2 with equal errors: it rotates the direction between
+ * the two, and the plane of both, exactly (TRIAD of these; Black 1964). Returns 0 if two directions
+ * coincide. */
 int starcat_fit_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
                       real m[9]) {
-  real bn[3], an[3], bt[3], at[3];
+  real bn[3], an[3], bt[3], at[3], bs[3], as[3];
   starcat_cross(b1, b2, bn);
   starcat_cross(a1, a2, an);
   const real b = starcat_dot(bn, bn), a = starcat_dot(an, an);
   if (!(b > R(1e-14)) || !(a > R(1e-14))) {
     return 0;
   }
+  for (uint32_t i = 0; i < 3u; i++) {
+    bs[i] = b1[i] + b2[i];
+    as[i] = a1[i] + a2[i];
+  }
   const real scale = R(1.0) / STARCAT_SQRT(a * b);
-  starcat_cross(bn, b1, bt);
-  starcat_cross(an, a1, at);
+  const real between = R(1.0) / STARCAT_SQRT(starcat_dot(bs, bs) * starcat_dot(as, as));
+  starcat_cross(bn, bs, bt);
+  starcat_cross(an, as, at);
   for (uint32_t i = 0; i < 3u; i++) {
     for (uint32_t j = 0; j < 3u; j++) {
-      m[3u * i + j] = b1[i] * a1[j] + scale * (bn[i] * an[j] + bt[i] * at[j]);
+      m[3u * i + j] = between * (bs[i] * as[j] + scale * bt[i] * at[j]) + scale * bn[i] * an[j];
     }
   }
   return 1;

@@ -35,7 +35,7 @@ real starcat_log_ball(uint32_t dimensions, real square_px, real rate) {
 }
 
 /* The rate by which squared residuals of magnitudes lower the number of ways; 0 if they are none. */
-real starcat_find_rate(real noise_px, real noise_mag) {
+static real find_rate(real noise_px, real noise_mag) {
   return (noise_px > R(0.0)) && (noise_mag > R(0.0)) ? R(1.0) / (R(3.0) * noise_px * noise_px)
                                                      : R(0.0);
 }
@@ -44,7 +44,7 @@ real starcat_find_rate(real noise_px, real noise_mag) {
  * in the fit, and the logarithm of the root of the determinant of their squared derivatives. */
 static real log_expected(const starcat_call *call, uint32_t n, real square_px, real log_root,
                          uint32_t unknowns) {
-  const real rate = starcat_find_rate(call->noise_px, call->noise_mag);
+  const real rate = find_rate(call->noise_px, call->noise_mag);
   return call->work->log_ways[n] + call->log_attitudes + log_root +
          starcat_log_ball(2u * n - unknowns, square_px, rate) - (real)n * call->camera.log_area;
 }

@@ -130,12 +130,18 @@ static starcat_status set_prior(const starcat_call *call, const real q[4], real 
   return STARCAT_OK;
 }
 
-/* Search only attitudes within the uncertainty of a prior, and the turn that noise can add. */
-void starcat_search_near(starcat_call *call, const real m[9], real uncertainty_rad) {
+/* The largest angle that noise can make of a turn by an angle. */
+real starcat_widen_turn(const starcat_call *call, real turn_rad) {
   const starcat_camera *camera = &call->camera.given;
-  const real turn = uncertainty_rad + R(2.0) * call->tolerance_px /
-                                          starcat_smaller(camera->width_px, camera->height_px);
-  const real half = STARCAT_SIN(R(0.5) * starcat_smaller(turn, WIDEST_TURN_RAD));
+  const real noise_rad =
+      R(2.0) * call->tolerance_px / starcat_smaller(camera->width_px, camera->height_px);
+  return starcat_smaller(turn_rad + noise_rad, WIDEST_TURN_RAD);
+}
+
+/* Search only attitudes within the uncertainty of a prior, and the turn that noise can add. */
+static void search_near(starcat_call *call, const real m[9], real uncertainty_rad) {
+  const real turn = starcat_widen_turn(call, uncertainty_rad);
+  const real half = STARCAT_SIN(R(0.5) * turn);
   call->near = m;
   call->near_square = R(8.0) * half * half;
   call->log_attitudes =
@@ -225,17 +231,10 @@ static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uin
   if (partner < 0) {
     return 0;
   }
-  real body[2][3], icrs[2][3];
-  for (uint32_t k = 0; k < 3u; k++) {
-    body[0][k] = w->body[a][k];
-    body[1][k] = w->body[b][k];
-    icrs[0][k] = first[k];
-    icrs[1][k] = w->near_icrs[starcat_find_near(w, (uint32_t)partner)][k];
-  }
-  if (!starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
+  if (!starcat_fit_triad(w->body[a], w->body[b], first,
+                         w->near_icrs[starcat_find_near(w, (uint32_t)partner)], m)) {
     return 0;
   }
-  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 2, 1); /* equal errors */
   p->is_stale = 1;
   return starcat_try_attitude(call, m, R(1.0));
 }
@@ -273,7 +272,7 @@ starcat_status starcat_track_frame(const starcat_image *image, const starcat_cam
   if (status != STARCAT_OK) {
     return status;
   }
-  starcat_search_near(&call, p.matrix, uncertainty_rad);
+  search_near(&call, p.matrix, uncertainty_rad);
   if (!predict_stars(&call, &p) && (call.counters.steps_left > 0u)) {
     result->steps = options->max_steps - call.counters.steps_left;
     return STARCAT_E_CAPACITY; /* the prior is too wide for this many stars */

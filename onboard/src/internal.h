@@ -246,7 +246,6 @@ real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_mat
                         const real terms[STARCAT_SHAPE_TERMS]);
 void starcat_share_ways(const starcat_call *call, uint32_t most);
 real starcat_log_ball(uint32_t dimensions, real square_px, real rate);
-real starcat_find_rate(real noise_px, real noise_mag);
 uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, real sigma_px);
 
 /* shape.c */
@@ -270,17 +269,13 @@ real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx
 
 /* verify.c */
 uint32_t starcat_count_fewer(const starcat_call *call);
-int starcat_spend_on_bound(const starcat_call *call);
-real starcat_find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
-                         uint32_t centroid, real offset[2]);
-int starcat_is_allowed(const starcat_call *call, const real m[9]);
 int starcat_try_shape(starcat_call *call, real m[9], const uint32_t triple[3], const real *icrs,
                       real terms[STARCAT_SHAPE_TERMS]);
 int starcat_try_attitude(starcat_call *call, const real m[9], real focal);
 void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px);
 
 /* identify.c */
-void starcat_search_near(starcat_call *call, const real m[9], real uncertainty_rad);
+real starcat_widen_turn(const starcat_call *call, real turn_rad);
 
 /* frame.c */
 starcat_status starcat_check_options(const starcat_options *o);
@@ -306,14 +301,11 @@ void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t
 int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 int starcat_look_up_pyramid(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 
-/* chains.c */
-int starcat_extend_chain(const starcat_image *image, const starcat_camera *camera,
-                         const starcat_options *options, const starcat_frame *frame,
-                         starcat_workspace *work, const starcat_result *candidate, real error_rad,
-                         real (*spots)[3], starcat_chain *chain, uint32_t *steps);
-real starcat_log_joint(const starcat_chain *chain, uint32_t frames, real rate);
-void starcat_confirm_candidate(const starcat_workspace *work, uint32_t count, real log_joint,
-                               starcat_result *result);
+/* composite.c */
+int starcat_join_frame(const starcat_image *image, const starcat_camera *camera,
+                       const starcat_options *options, const starcat_frame *frame,
+                       starcat_workspace *work, real turn_rad, starcat_composite *c, real *x_px,
+                       real *y_px, uint32_t *steps);
 
 /* votes.c */
 #define STARCAT_MAX_VOTERS 32u /* centroids around a reference */

@@ -11,6 +11,7 @@
 #define BLOCKS_OF_PARITY_CHECK 4u /* a group takes at most as long as this many blocks */
 #define MOST_BLOCKS_PER_TICK 65536u
 #define CORRECTED_RAD R(1e-3) /* largest change of the attitude by correcting a frame */
+#define MOST_TURN_RAD R(0.175) /* between refused frames: half of the widest prior */
 
 /* Settings and the session itself. */
 
@@ -72,7 +73,7 @@ static starcat_status note_image(starcat_session *s, starcat_status status) {
   s->suspect = 0;
   s->scrub_slot = s->slots.active;
   s->scrub_next = 0;
-  s->chain.n_spots = 0;
+  s->composite.n_spots = 0;
   if (status == STARCAT_OK) {
     (void)starcat_get_camera(&s->image, &s->camera);
   }
@@ -153,25 +154,26 @@ static const starcat_camera *choose_camera(const starcat_session *s) {
   return s->settings->has_own_camera != 0u ? &s->settings->camera : &s->camera;
 }
 
-/* Track a frame from an attitude, which also corrects its centroids: `moved` has them. */
+/* Track a frame from an attitude, which also corrects its centroids. */
 static starcat_status track_from(starcat_session *s, const starcat_frame *frame,
                                  const starcat_real q[4], starcat_real error_rad,
-                                 uint32_t max_steps, starcat_answer *answer, starcat_frame *moved) {
+                                 uint32_t max_steps, starcat_answer *answer) {
   starcat_options options = s->settings->options;
+  starcat_frame moved = *frame;
   options.max_steps = max_steps;
-  *moved = *frame;
   if (is_correctable(s, frame) != 0) {
     for (uint32_t n = 0; n < frame->count; n++) {
       s->x_px[n] = frame->x_px[n];
       s->y_px[n] = frame->y_px[n];
     }
     s->settings->correct(s->settings->context, q, frame->count, s->x_px, s->y_px);
-    moved->x_px = s->x_px;
-    moved->y_px = s->y_px;
+    moved.x_px = s->x_px;
+    moved.y_px = s->y_px;
   }
   answer->result.steps = 0;
-  const starcat_status status = starcat_track_frame(&s->image, choose_camera(s), &options, moved, q,
-                                                    error_rad, &s->workspace, &answer->result);
+  const starcat_status status =
+      starcat_track_frame(&s->image, choose_camera(s), &options, &moved, q, error_rad,
+                          &s->workspace, &answer->result);
   answer->steps += answer->result.steps;
   return status;
 }
@@ -180,10 +182,9 @@ static starcat_status track_from(starcat_session *s, const starcat_frame *frame,
 static starcat_status track_frame(starcat_session *s, const starcat_frame *frame,
                                   starcat_answer *answer) {
   starcat_counts *counts = &s->counts;
-  starcat_frame moved;
   answer->mode = STARCAT_MODE_TRACK;
   const starcat_status status = track_from(s, frame, s->q_prior, s->settings->prior_error_rad,
-                                           s->settings->max_steps_track, answer, &moved);
+                                           s->settings->max_steps_track, answer);
   counts->tracks_failed += status == STARCAT_IDENTIFIED ? 0u : 1u;
   counts->tracks_refused += status == STARCAT_E_CAPACITY ? 1u : 0u;
   if (answer->steps > counts->most_steps_track) {
@@ -194,13 +195,13 @@ static starcat_status track_frame(starcat_session *s, const starcat_frame *frame
 
 /* Track a frame from the attitude that was found in it, with corrected centroids. */
 static starcat_status track_again(starcat_session *s, const starcat_frame *frame,
-                                  uint32_t max_steps, starcat_answer *answer,
-                                  starcat_frame *moved) {
+                                  starcat_real error_rad, uint32_t max_steps,
+                                  starcat_answer *answer) {
   starcat_real q[4];
   for (uint32_t n = 0; n < 4u; n++) {
     q[n] = answer->result.q_body_from_icrs[n];
   }
-  return track_from(s, frame, q, CORRECTED_RAD, max_steps, answer, moved);
+  return track_from(s, frame, q, error_rad, max_steps, answer);
 }
 
 /* Identify a frame lost in space, then again with corrected centroids. */
@@ -208,7 +209,6 @@ static starcat_status identify_frame(starcat_session *s, const starcat_frame *fr
                                      starcat_answer *answer) {
   const uint32_t before = answer->steps;
   starcat_options options = s->settings->options;
-  starcat_frame moved;
   starcat_result *result = &answer->result;
   options.max_steps = s->settings->max_steps_identify;
   answer->mode = STARCAT_MODE_IDENTIFY;
@@ -223,7 +223,7 @@ static starcat_status identify_frame(starcat_session *s, const starcat_frame *fr
       result->reason = STARCAT_REASON_STEPS;
       status = STARCAT_E_BUDGET;
     } else {
-      status = track_again(s, frame, left, answer, &moved);
+      status = track_again(s, frame, CORRECTED_RAD, left, answer);
     }
   }
   if (answer->steps - before > s->counts.most_steps_identify) {
@@ -232,53 +232,16 @@ static starcat_status identify_frame(starcat_session *s, const starcat_frame *fr
   return status;
 }
 
-/* CRC of the chain and its spots: what chance has to be compared with must not change by a fault. */
-static uint32_t find_chain_crc(const starcat_session *s) {
-  const uint32_t crc =
-      starcat_update_crc(0, (const uint8_t *)&s->chain, offsetof(starcat_chain, crc));
-  return starcat_update_crc(crc, (const uint8_t *)s->spots,
-                            s->chain.n_spots * (uint32_t)sizeof s->spots[0]);
+static uint32_t find_composite_crc(const starcat_session *s) {
+  return starcat_update_crc(0, (const uint8_t *)&s->composite, offsetof(starcat_composite, crc));
 }
 
-/* Whether there is a chain that a frame can extend. */
-static int has_chain(const starcat_session *s, uint64_t time) {
-  return (s->chain.n_spots > 0u) && (s->chain.n_spots <= STARCAT_CHAIN_SPOTS) &&
-         (find_distance(time, s->chain.time) < s->settings->prior_age) &&
-         (find_chain_crc(s) == s->chain.crc);
-}
-
-/* Whether the last call has found an attitude without a shape that chance alone makes uncertain. */
-static int has_candidate(const starcat_result *result) {
-  return (result->log_chance < R(0.0)) && (result->n_shape == 0u) &&
-         ((result->reason == STARCAT_REASON_NONE) || (result->reason == STARCAT_REASON_CHANCE));
-}
-
-/* Add the candidate of the last call to a chain, whose last attitude it is near if `error_rad` is
- * not 0. The answer takes `most` steps at most. */
-static int extend_chain(starcat_session *s, const starcat_frame *frame, real error_rad,
-                        uint32_t most, starcat_answer *answer, starcat_chain *chain) {
-  /* The spots of a new chain come after those of the chain that is kept. */
-  starcat_real(*spots)[3] = s->spots + (s->chain.n_spots - chain->n_spots);
-  starcat_options options = s->settings->options;
-  uint32_t steps = 0;
-  options.max_steps = most - answer->steps;
-  const int good = has_candidate(&answer->result) &&
-                   (starcat_extend_chain(&s->image, choose_camera(s), &options, frame,
-                                         &s->workspace, &answer->result, error_rad,
-                                         spots, chain, &steps) != 0);
-  answer->steps += steps;
-  return good;
-}
-
-/* Keep a chain, whose spots begin at one of those in memory, for the next frame. */
-static void keep_chain(starcat_session *s, const starcat_chain *chain, uint32_t from,
-                       uint64_t time) {
-  for (uint32_t n = 0; n < 3u * chain->n_spots; n++) {
-    s->spots[n / 3u][n % 3u] = s->spots[from + n / 3u][n % 3u];
-  }
-  s->chain = *chain;
-  s->chain.time = time;
-  s->chain.crc = find_chain_crc(s);
+/* Whether a frame can follow the composite. What chance has to be compared with must not change by
+ * a fault in memory. */
+static int has_composite(const starcat_session *s, uint64_t time) {
+  return (s->composite.n_spots <= STARCAT_MAX_CENTROIDS) &&
+         (find_distance(time, s->composite.time) < s->settings->prior_age) &&
+         (find_composite_crc(s) == s->composite.crc);
 }
 
 static int can_confirm(const starcat_session *s, starcat_status status) {
@@ -286,46 +249,45 @@ static int can_confirm(const starcat_session *s, starcat_status status) {
          ((status == STARCAT_NO_MATCH) || (status == STARCAT_E_BUDGET));
 }
 
-/* Answer a refused frame if the candidates of the frames before confirm it; keep its candidate. */
+/* Answer a refused frame if it has an attitude near that of the spots of all refused frames: those
+ * before it do not show that the last turn was found. An attitude that is near after the turn that
+ * was found is near after every turn that is allowed, within twice the turn. */
 static starcat_status confirm_frame(starcat_session *s, const starcat_frame *frame, uint64_t time,
                                     starcat_answer *answer) {
   const starcat_answer refused = *answer;
-  const starcat_settings *settings = s->settings;
-  const uint32_t most = answer->steps + settings->max_steps_confirm;
-  starcat_chain linked, begun;
-  starcat_frame moved = *frame;
-  const int is_followed = has_chain(s, time);
-  s->chain.n_spots = is_followed ? s->chain.n_spots : 0u;
-  linked = s->chain;
-  clear(&begun, sizeof begun);
-  begun.first = s->n_frames;
-  if (is_correctable(s, frame) && has_candidate(&answer->result)) {
-    (void)track_again(s, frame, settings->max_steps_confirm, answer, &moved);
+  const real turn_rad = starcat_smaller(s->settings->prior_error_rad, MOST_TURN_RAD);
+  starcat_options options = s->settings->options;
+  starcat_result *result = &answer->result;
+  starcat_status status = STARCAT_NO_MATCH;
+  uint32_t left = s->settings->max_steps_confirm, steps = 0;
+  options.max_steps = left;
+  s->composite.n_spots = has_composite(s, time) != 0 ? s->composite.n_spots : 0u;
+  const int is_joined =
+      starcat_join_frame(&s->image, choose_camera(s), &options, frame, &s->workspace, turn_rad,
+                         &s->composite, s->x_px, s->y_px, &steps);
+  s->composite.time = time;
+  s->composite.crc = find_composite_crc(s);
+  left -= steps;
+  if (is_joined != 0) {
+    const starcat_frame whole = {s->composite.n_spots, s->x_px, s->y_px, s->composite.magnitude,
+                                 NULL};
+    options.max_steps = left;
+    result->steps = 0;
+    status = starcat_identify_frame(&s->image, choose_camera(s), &options, &whole, &s->workspace,
+                                    result);
+    left -= result->steps;
   }
-  int is_linked =
-      is_followed && extend_chain(s, &moved, settings->prior_error_rad, most, answer, &linked);
-  const int is_begun = !is_linked && extend_chain(s, &moved, R(0.0), most, answer, &begun);
-  if (is_followed && !is_linked) {
-    (void)track_from(s, frame, s->chain.q, settings->prior_error_rad, most - answer->steps, answer,
-                     &moved);
-    is_linked = extend_chain(s, &moved, settings->prior_error_rad, most, answer, &linked);
-  }
-  if (is_linked != 0) {
-    const real rate = starcat_find_rate(settings->options.noise_px, settings->options.noise_mag);
-    const real log_joint = starcat_log_joint(&linked, s->n_frames - linked.first, rate);
-    if (log_joint <= settings->options.log_chance) {
-      starcat_confirm_candidate(&s->workspace, frame->count, log_joint, &answer->result);
+  answer->steps += s->settings->max_steps_confirm - left;
+  if (status == STARCAT_IDENTIFIED) {
+    const real log_chance = result->log_chance;
+    status = track_again(s, frame, R(2.0) * turn_rad, left, answer);
+    if (status == STARCAT_IDENTIFIED) {
+      result->log_chance = starcat_larger(result->log_chance, log_chance);
       answer->mode = STARCAT_MODE_CONFIRM;
-      return STARCAT_IDENTIFIED;
+      return status;
     }
-    linked.n_spots = linked.n_spots <= STARCAT_CHAIN_SPOTS ? linked.n_spots : 0u;
-    keep_chain(s, &linked, 0, time);
-  } else if (is_begun != 0) {
-    keep_chain(s, &begun, s->chain.n_spots, time);
-  } else {
-    /* the chain waits for the next frame */
   }
-  answer->result = refused.result;
+  *result = refused.result;
   return refused.status;
 }
 
@@ -359,7 +321,6 @@ starcat_status starcat_answer_frame(starcat_session *session, const starcat_fram
     return answer->status;
   }
   answer->status = starcat_check_session(s);
-  s->n_frames++;
   if (answer->status == STARCAT_OK) {
     answer->status = is_fresh(s, time) != 0 ? track_frame(s, frame, answer) : STARCAT_NO_MATCH;
     if (answer->status != STARCAT_IDENTIFIED) {
@@ -378,7 +339,7 @@ starcat_status starcat_answer_frame(starcat_session *session, const starcat_fram
     s->has_prior = 1;
     s->prior_time = time;
     s->has_attitude = 1;
-    s->chain.n_spots = 0;
+    s->composite.n_spots = 0;
     s->attitude_time = time;
     for (uint32_t n = 0; n < 4u; n++) {
       s->q_prior[n] = answer->result.q_body_from_icrs[n];

@@ -271,7 +271,7 @@ uint32_t starcat_count_fewer(const starcat_call *call) {
 
 /* Take the steps of the bound of an agreement. Magnitudes cost most: every centroid is compared
  * with every star, and a polynomial is summed. Returns 0 if the budget is used up. */
-int starcat_spend_on_bound(const starcat_call *call) {
+static int spend_on_bound(const starcat_call *call) {
   const uint32_t most = starcat_count_fewer(call);
   uint32_t steps = STEPS_OF_MATCH * (call->own->count + call->own->n_within);
   if (call->noise_mag > R(0.0)) {
@@ -366,7 +366,7 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
   if (matched < STARCAT_MIN_STARS) {
     return;
   }
-  if (!starcat_spend_on_bound(call) ||
+  if (!spend_on_bound(call) ||
       ((free > 0u) && !starcat_spend_steps(call, STEPS_OF_FACE << free))) {
     found->n_matched = 0; /* as if nothing had matched */
     return;
@@ -459,7 +459,7 @@ static void try_shapes(starcat_call *call) {
 
 /* Offset of a centroid from its star in an agreement, with the places that are in use. Returns the
  * squared chord between both directions. */
-real starcat_find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
+static real find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
                          uint32_t centroid, real offset[2]) {
   real icrs[3], body[3], x = STARCAT_LARGEST_PX, y = STARCAT_LARGEST_PX;
   starcat_read_star(call->image,
@@ -500,7 +500,7 @@ static void sum_stars(const starcat_call *call, const starcat_agreement *found, 
     if (found->star[i] >= 0) {
       real offset[2];
       const real weight = find_weight(call, i);
-      s->rad += starcat_find_offset(call, found, m, i, offset);
+      s->rad += find_offset(call, found, m, i, offset);
       const real square = offset[0] * offset[0] + offset[1] * offset[1];
       s->px += square;
       s->chi += weight * square;
@@ -525,7 +525,7 @@ static int determines_frame(const starcat_call *call, const starcat_agreement *f
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (found->star[i] >= 0) {
       real offset[2];
-      (void)starcat_find_offset(call, found, found->matrix, i, offset);
+      (void)find_offset(call, found, found->matrix, i, offset);
       influence = starcat_larger(influence, starcat_find_influence(call, i, offset[0], offset[1],
                                                                    find_weight(call, i), step));
     }
@@ -628,7 +628,7 @@ static void check_agreement(starcat_call *call, starcat_agreement *found, int pl
 }
 
 /* Whether an attitude is within the error of the prior, if there is one. */
-int starcat_is_allowed(const starcat_call *call, const real m[9]) {
+static int is_allowed(const starcat_call *call, const real m[9]) {
   real square = R(0.0);
   for (uint32_t k = 0; (k < 9u) && (call->near != NULL); k++) {
     const real apart = m[k] - call->near[k];
@@ -650,7 +650,7 @@ static int settle_agreement(starcat_call *call) {
     }
     check_agreement(call, found, plain);
   }
-  if (starcat_is_allowed(call, found->matrix) &&
+  if (is_allowed(call, found->matrix) &&
       ((w->best.n_matched == 0u) || is_better(found, &w->best))) {
     w->best = *found;
   }

@@ -13,10 +13,10 @@ for source in src/*.c; do
 done
 code_of() { $ARM-size "$@" | awk 'NR > 1 { sum += $1 + $2 + $3 } END { print sum }'; }
 update=$(code_of "$out/update.o")
-session=$(code_of "$out/session.o" "$out/chains.o")
+session=$(code_of "$out/session.o" "$out/composite.o")
 code=$(code_of "$out"/*.o)
 echo "size: code and constants of the library for a Cortex-M7, -Os: $code bytes (at most $limit)"
-echo "size: of these, images in flight (update.c): $update bytes; sessions (session.c, chains.c): $session bytes"
+echo "size: of these, images in flight (update.c): $update bytes; sessions (session.c, composite.c): $session bytes"
 echo "size: without both: $((code - update - session)) bytes"
 sh amalgamate.sh "$out/one"
 $ARM-gcc $FLAGS $ARM_FLAGS -c "$out/one/starcat.c" -o "$out/one.out"

@@ -165,7 +165,7 @@ static void check_excess(const unit_sky *sky) {
 static void check_one_place(const unit_sky *sky) {
   const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
   static const starcat_real axis[2][3] = {{0, 0, 1}, {1, 0, 0}};
-  starcat_real star[3], other[3];
+  starcat_real star[3], other[3], normal[3];
   starcat_call call;
   CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
   const starcat_agreement best = unit_work.best;
@@ -180,7 +180,12 @@ static void check_one_place(const unit_sky *sky) {
   }
   starcat_read_star(&sky->image, 0, star);
   starcat_read_star(&sky->image, 1, other);
-  CHECK(starcat_fit_triad(axis[0], axis[1], star, other, unit_work.best.matrix));
+  starcat_cross(star, other, normal);
+  const starcat_real length = STARCAT_SQRT(starcat_dot(normal, normal));
+  for (uint32_t k = 0; k < 3u; k++) {
+    normal[k] /= length;
+  }
+  CHECK(starcat_fit_triad(axis[0], axis[1], star, normal, unit_work.best.matrix));
   CHECK_IS(starcat_end_call(&call, &sky->options, &unit_result), STARCAT_IDENTIFIED);
   CHECK(unit_result.covariance_rad2[0] == (starcat_real)0.0);
   unit_work.best.free = 2; /* nor with a shape, whose terms are 0 */

@@ -52,10 +52,9 @@ by which its typical expected number is above or below 1e-9 (`_log_share`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 
@@ -138,58 +137,6 @@ def log_false_match_probability(
             face = expected + _log_ball(2 * n - len(columns), square_px, rate)
             total = float(np.logaddexp(total, box + face))
     return min(0.0, total + log_growth + log_values)
-
-
-class FrameEvidence(NamedTuple):
-    """Spots of a frame that agree with an attitude, for the joint bound of several frames."""
-
-    n: int  # spots that agree
-    square_px: float  # sum of their squared residuals
-    # Logarithm of the expected number of agreements, without the ball of the residuals.
-    log_number: float
-    rate: float  # of magnitudes, see `rate_of_magnitudes`
-
-
-def evidence_of_frame(
-    square_px: float,
-    rows: Array,
-    n_centroids: int,
-    stars_in_frame: int,
-    log_area: float,
-    log_attitudes: float,
-    rate: float = 0.0,
-    deviations: Deviations | None = None,
-) -> FrameEvidence | None:
-    """Return the evidence of the spots of a frame; None if they determine no attitude.
-
-    The parameters are those of `log_false_match_probability`, but ``log_area`` is the logarithm of
-    the area where the spots can be, pixels squared, and ``rate`` that of magnitudes.
-    """
-    n = len(rows)
-    if n < 2:
-        return None
-    jacobian = rows.reshape(2 * n, -1)
-    sign, log_determinant = np.linalg.slogdet(jacobian.T @ jacobian)
-    if sign <= 0:
-        return None
-    assignments = log_assignments(n, n_centroids, max(n, stars_in_frame))
-    if deviations is not None:
-        assignments = float(log_weighted_assignments(n, deviations)[n])
-    log_values = math.log(max(1, n_centroids - 1))
-    log_number = assignments + log_attitudes + 0.5 * log_determinant - n * log_area + log_values
-    return FrameEvidence(n, square_px, log_number, rate)
-
-
-def joint_false_match_probability(frames: Sequence[FrameEvidence]) -> float:
-    """Bound the probability that chance agrees as well with attitudes of several frames.
-
-    It is the expected number of tuples of attitudes, one per frame and each within the volume of
-    its frame, whose squared residuals have a sum as low as these.
-    """
-    n_degrees = sum(2 * frame.n - 3 for frame in frames)
-    square_px = math.fsum(frame.square_px for frame in frames)
-    ball = _log_ball(n_degrees, square_px, max(frame.rate for frame in frames))
-    return math.exp(min(0.0, ball + math.fsum(frame.log_number for frame in frames)))
 
 
 def log_attitudes_within(angle_rad: float) -> float:

@@ -4,17 +4,17 @@ The camera is assumed to keep turning as it did, about the same axes of its own 
 error of the prediction follows from the errors of the last predictions. A frame that is not there
 is searched for in the whole sky at once, so a jump costs one slow frame but no answer.
 
-Before the first answer, and after a jump, candidates of successive frames can confirm each other
-(`starcat.matcher.chains`).
+Before the first answer, and after a jump, frames without an answer are put together
+(`starcat.matcher.composite`): together they can have an attitude that none of them has alone.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,12 +23,11 @@ from starcat.arguments import check_type, without_unit
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
-from starcat.matcher.chains import Chain, chain_of, extended
-from starcat.matcher.chance import log_attitudes_within
+from starcat.matcher.composite import Composite, composite_of, joined
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.observation import FrameLike
+from starcat.matcher.observation import FrameLike, observe
 from starcat.matcher.options import OPTIONS
-from starcat.matcher.prior import Prior, PriorLike, turn_of_noise_rad
+from starcat.matcher.prior import PriorLike, turn_of_noise_rad
 from starcat.matcher.result import MatchResult
 
 MAX_TURN_DEG = OPTIONS["prior_error_deg"].high
@@ -46,11 +45,8 @@ FADING = 0.5
 MAX_STEPS = 5.0
 """Longest time of a prediction after the last answer, over the time between the last two."""
 
-MAX_CHAINS = 4
-"""Number of chains of candidates that are followed."""
-
 MAX_GAP = 2
-"""Largest number of frames from a candidate to the next one of its chain."""
+"""Largest number of frames from one frame of a composite to the next one."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +58,6 @@ class _Motion:
     step: float = 1.0
     turn: Turn = (0.0, 0.0, 0.0)
     change_rad: float = math.inf
-
-
-class _Followed(NamedTuple):
-    """A chain of candidates, and the motion that it predicts."""
-
-    chain: Chain
-    motion: _Motion
 
 
 @dataclass
@@ -94,10 +83,10 @@ class Tracker:
     max_turn_deg: float = 5.0
     _motion: _Motion | None = field(default=None, init=False, repr=False)
     _time: float = field(default=-math.inf, init=False, repr=False)
-    _number: int = field(default=0, init=False, repr=False)  # of the next frame
-    # Chains before the next frame, and the chains that the last attempt has made of it.
-    _chains: tuple[_Followed, ...] = field(default=(), init=False, repr=False)
-    _attempted: tuple[_Followed, ...] = field(default=(), init=False, repr=False)
+    # The composite before the next frame, and the one that the last attempt has made with it.
+    _composite: Composite | None = field(default=None, init=False, repr=False)
+    _attempted: Composite | None = field(default=None, init=False, repr=False)
+    _gap: int = field(default=0, init=False, repr=False)  # frames since the last of the composite
 
     def __post_init__(self) -> None:
         check_type("matcher", self.matcher, Matcher, "a starcat.Matcher")
@@ -115,7 +104,7 @@ class Tracker:
     def reset(self) -> None:
         """Forget all frames: the next one is searched for in the whole sky."""
         self._motion, self._time = None, -math.inf
-        self._chains = self._attempted = ()
+        self._composite = self._attempted = None
 
     def identify(
         self,
@@ -145,9 +134,9 @@ class Tracker:
         MatchResult
             ``origin`` is ``tracking`` if it was found near the prediction, and ``lost_in_space``
             if it was found in the whole sky. Near the prediction fewer stars are enough, as
-            chance could only agree there. A frame that has only a candidate can become an answer
-            if it agrees with the candidates of the frames before: ``false_match_probability`` is
-            then the joint bound.
+            chance could only agree there. A frame that is not answered alone can be answered
+            together with the frames before it, which its spots continue:
+            ``false_match_probability`` is then the larger one of the bounds of both.
 
         Raises
         ------
@@ -187,50 +176,46 @@ class Tracker:
         identify = partial(
             self.matcher.identify, centroids_px, camera, fov_error=fov_error, **beside
         )
-        answer, self._attempted = None, ()
+        answer, self._attempted = None, None
         if expected is not None or error_deg is not None:
             answer = identify(prior=expected, prior_error_deg=error_deg)
         if answer is None or answer.status == "no_match":
             answer = identify()
         if answer.status == "no_match" and not fov_error:
-            answer = self._confirmed(answer, identify, now, camera)
+            answer = self._confirmed(answer)
         return answer
 
-    def _confirmed(
-        self, refused: MatchResult, identify: Callable[..., MatchResult], now: float, camera: Camera
-    ) -> MatchResult:
-        """Return the answer to a refused frame that earlier candidates confirm, if they do."""
-        settings, database = self.matcher.settings, self.matcher.database
-        whole_sky = _uncertain(refused)
-        followed: list[_Followed] = []
-        for chain, motion in self._chains:
-            expected, error_deg = self._predicted_by(motion, now, camera)
-            if expected is None or error_deg is None:
-                continue
-            prior = Prior(np.array(expected), math.radians(error_deg))
-            largest_rad = prior.largest_turn_rad(camera, settings.tolerance_px)
-            near = identify(prior=expected, prior_error_deg=error_deg)
-            candidate = near if near.ok else _uncertain(near)
-            if candidate is None and whole_sky is not None:
-                is_there = prior.allows(whole_sky.matrix, camera, settings.tolerance_px)
-                candidate = whole_sky if is_there else None
-            if candidate is not None:
-                longer = extended(
-                    chain, candidate, self._number, settings, database,
-                    log_attitudes_within(largest_rad),
-                )  # fmt: skip
-                if longer is not None:
-                    q = _quaternion_of(candidate)
-                    followed.append(_Followed(longer, self._learnt(motion, q, now, camera)))
-        if whole_sky is not None:
-            begun = chain_of(whole_sky, self._number, settings, database)
-            if begun is not None:
-                followed.append(_Followed(begun, _Motion(_quaternion_of(whole_sky), now)))
-        followed.sort(key=_chance_of)
-        self._attempted = tuple(followed)
-        if followed and _chance_of(followed[0]) <= settings.max_false_match_probability:
-            return followed[0].chain.confirmed
-        return refused
+    def _confirmed(self, refused: MatchResult) -> MatchResult:
+        """Return the answer to a refused frame that the frames before it confirm, if they do.
+
+        The composite of the frames has to have an attitude, and the frame itself one near it: the
+        spots of the frames before do not show that the last turn was found. The two bounds hold
+        for two hypotheses: that the spots of all frames are false, and that those of this frame
+        are. An attitude that is near after the turn that was found is near after every turn that
+        is allowed, within twice the turn.
+        """
+        frame, matcher = refused.frame, self.matcher
+        if frame is None:
+            return refused
+        seen = observe(frame, matcher.settings)
+        turn_deg = min(self.max_turn_deg, 0.5 * MAX_TURN_DEG)
+        before, self._attempted = self._composite, composite_of(seen)
+        longer = None if before is None else joined(before, seen, math.radians(turn_deg))
+        if longer is None:
+            return refused
+        self._attempted = longer
+        centroids_px, mag = longer.pixels(frame.camera)
+        whole = matcher.identify(centroids_px, frame.camera, mag=mag)
+        if not whole.ok:
+            return refused
+        answer = matcher.identify(
+            frame.centroids_px, frame.camera, mag=frame.mag, sigma_px=frame.sigma_px,
+            prior=whole.q_body_from_icrs, prior_error_deg=2.0 * turn_deg,
+        )  # fmt: skip
+        if not answer.ok:
+            return refused
+        chance = max(whole.false_match_probability, answer.false_match_probability)
+        return replace(answer, false_match_probability=chance)
 
     def record(
         self,
@@ -241,20 +226,14 @@ class Tracker:
     ) -> None:
         """End a frame with its result, or with None if the frame could not be read."""
         now = self._next_time(time_s)
-        self._time, followed, self._attempted = now, self._attempted, ()
-        self._number += 1
+        self._time, made, self._attempted = now, self._attempted, None
         if found is None or not found.ok:
-            near = (
-                earlier for earlier in self._chains if self._number - earlier.chain.last <= MAX_GAP
-            )
-            self._chains = tuple(sorted((*followed, *near), key=_chance_of)[:MAX_CHAINS])
+            self._gap = 1 if made is not None else self._gap + 1
+            self._composite = made or (self._composite if self._gap <= MAX_GAP else None)
             return
-        self._chains = ()
+        self._composite = None
         x, y, z, w = found.q_body_from_icrs.tolist()
-        if followed and np.array_equal(found.matrix, followed[0].chain.answer.matrix):
-            self._motion = followed[0].motion
-            return
-        is_new = found.origin == "lost_in_space"
+        is_new = found.origin == "lost_in_space" or made is not None
         # An attitude beyond the prediction means a new motion: the next attitude is expected to
         # be the same as this one, within the largest turn.
         self._motion = (
@@ -325,18 +304,3 @@ class Tracker:
         if math.isfinite(before.change_rad):
             change_rad = max(change_rad, FADING * before.change_rad)
         return _Motion(q, now, step, turn_between(before.q_body_from_icrs, q), change_rad)
-
-
-def _uncertain(refused: MatchResult) -> MatchResult | None:
-    """Return the candidate of a frame that was refused for its probability alone, if it has one."""
-    why = refused.refusal
-    return why.candidate if why is not None and why.reason == "chance" else None
-
-
-def _chance_of(followed: _Followed) -> float:
-    return followed.chain.false_match_probability
-
-
-def _quaternion_of(answer: MatchResult) -> Quaternion:
-    x, y, z, w = answer.q_body_from_icrs.tolist()
-    return x, y, z, w

@@ -5,25 +5,20 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 from frames import few_in_numpy, frames_of
 from slew import steady_turn, wrong_by
 
-from starcat.geometry.attitude import random_attitudes
-from starcat.matcher.chains import chain_of, extended
-from starcat.matcher.chance import (
-    LOG_ALL_ATTITUDES,
-    evidence_of_frame,
-    joint_false_match_probability,
-    log_attitudes_within,
-    log_false_match_probability,
-)
+from starcat.geometry.attitude import after_turn, matrix_from_quaternion, random_attitudes
+from starcat.matcher.chance import LOG_ALL_ATTITUDES, log_attitudes_within
+from starcat.matcher.composite import composite_of, joined
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.observation import as_frame, observe
+from starcat.matcher.settings import Settings
 from starcat.matcher.tracking import Tracker
 from starcat.pipeline.simulation.simulate import Noise
 
-WEAK = Noise(1.0, drop_probability=0.6, false_stars=6, noise_mag=0.3)
-STATED = {"noise_px": 1.0, "noise_mag": 0.3}
+WEAK = Noise(4.0, drop_probability=0.5, false_stars=6, noise_mag=0.3)
+STATED = {"noise_px": 4.0, "noise_mag": 0.3}
 
 
 def is_right(found, matrix):
@@ -64,15 +59,62 @@ def _traces(count):
     return np.einsum("kii->k", random_attitudes(count, np.random.default_rng(1)))
 
 
-def test_the_joint_bound_of_one_frame_is_its_bound(sky):
-    rows = np.random.default_rng(3).normal(scale=800.0, size=(6, 2, 3))
-    area = math.log(sky.camera.width_px * sky.camera.height_px)
-    one = evidence_of_frame(3.0, rows, 12, 15, area, LOG_ALL_ATTITUDES)
-    alone = math.exp(log_false_match_probability(3.0, rows, 12, 15, sky.camera))
-    # Two and more spots can agree with an attitude that is known, not four and more.
-    assert joint_false_match_probability([one]) == pytest.approx(alone * 11.0 / 9.0, rel=1e-9)
-    near = evidence_of_frame(3.0, rows, 12, 15, area, log_attitudes_within(0.02))
-    assert joint_false_match_probability([one, near]) < 1e-3 * alone
+def _observed(sky, body, noise_px=1.0):
+    px = sky.camera.pixels_from_directions(body)
+    return observe(as_frame(px, sky.camera), Settings(noise_px=noise_px))
+
+
+def _directions(sky, count, generator):
+    size_px = np.array([sky.camera.width_px, sky.camera.height_px])
+    px = (0.2 + 0.6 * generator.uniform(size=(count, 2))) * size_px
+    return sky.camera.directions_from_pixels(px)
+
+
+def test_frames_are_joined_by_the_turn_of_the_camera(sky):
+    generator = np.random.default_rng(3)
+    for _ in range(20):
+        shared, old, new = (_directions(sky, count, generator) for count in (5, 4, 4))
+        x, y, z = generator.normal(size=3)
+        scale = 0.015 / math.hypot(x, y, z)
+        turn = matrix_from_quaternion(
+            np.array(after_turn((0.0, 0.0, 0.0, 1.0), (x * scale, y * scale, z * scale)))
+        )
+        first = composite_of(_observed(sky, np.concatenate([shared, old])))
+        second = _observed(sky, np.concatenate([shared @ turn.T, new]))
+        both = joined(first, second, 0.02)
+        assert len(both) == 13
+        assert sorted(both.seen) == [0] * 4 + [1] * 4 + [2] * 5
+        apart = np.linalg.norm(both.body[both.seen == 2][:, None] - shared @ turn.T, axis=2)
+        assert apart.min(axis=1).max() < 1e-9
+        # A spot of one frame is dropped when a second frame does not have it.
+        third = joined(both, _observed(sky, shared @ turn.T), 0.02)
+        assert sorted(third.seen) == [0] * 4 + [3] * 5
+        assert joined(first, second, 0.002) is None
+
+
+def test_spots_that_are_seen_again_have_the_mean_of_their_places(sky):
+    generator, noise = np.random.default_rng(4), 2e-5
+    truth = _directions(sky, 12, generator)
+    frames = [truth + noise * generator.normal(size=truth.shape) for _ in range(9)]
+    composite = composite_of(_observed(sky, frames[0]))
+    for body in frames[1:]:
+        composite = joined(composite, _observed(sky, body), 0.01)
+    assert composite.seen.tolist() == [9] * 12
+    matched = np.linalg.norm(composite.body[:, None] - frames[-1], axis=2).argmin(axis=1)
+    # The camera frame is that of the last frame, as its own spots tell it.
+    u, _, vt = np.linalg.svd(composite.body.T @ truth[matched])
+    apart = composite.body - truth[matched] @ (u @ vt).T
+    assert 0.2 * noise < np.sqrt(np.mean(apart**2)) < 0.5 * noise
+
+
+def test_frames_that_share_no_spots_are_not_joined(sky):
+    generator, made = np.random.default_rng(7), 0
+    for _ in range(40):
+        first = composite_of(_observed(sky, _directions(sky, 9, generator)))
+        made += joined(first, _observed(sky, _directions(sky, 9, generator)), 0.02) is not None
+    assert made <= 4
+    lone = _observed(sky, _directions(sky, 1, generator))
+    assert joined(composite_of(lone), lone, 0.02) is None
 
 
 def test_weak_frames_of_a_sequence_confirm_each_other(sky):
@@ -91,8 +133,8 @@ def test_weak_frames_of_a_sequence_confirm_each_other(sky):
                 break
         alone += single
         together += found.ok
-    assert together >= alone
-    assert confirmed >= 2
+    assert together > alone
+    assert confirmed >= 12
 
 
 def test_the_same_spots_again_are_no_second_proof(sky):
@@ -104,13 +146,23 @@ def test_the_same_spots_again_are_no_second_proof(sky):
         tracker = Tracker(matcher, max_turn_deg=1.0)
         for _ in range(4):
             assert not tracker.identify(frame.centroids_px, mag=frame.mag).ok
-        candidate = found.refusal.candidate
-        begun = chain_of(candidate, 0, matcher.settings, sky)
-        assert begun is not None
-        near = log_attitudes_within(0.02)
-        assert extended(begun, candidate, 1, matcher.settings, sky, near) is None
-        repeated += candidate.false_match_probability < 1e-4
+        repeated += found.refusal.candidate.false_match_probability < 1e-4
     assert repeated >= 3
+
+
+def test_a_frame_without_sky_is_not_answered_by_the_frames_before_it(sky):
+    matcher, generator, tried = Matcher(sky, **STATED), np.random.default_rng(9), 0
+    for frame in frames_of(sky, 60, WEAK, seed=8):
+        tracker = Tracker(matcher, max_turn_deg=1.0)
+        if tracker.identify(frame.centroids_px, mag=frame.mag).ok:
+            continue
+        tried += 1
+        for _ in range(10):
+            # Three of its spots are where the frame before has them, so that both are joined.
+            px = generator.uniform(0.0, sky.camera.width_px, frame.centroids_px.shape)
+            px[:3] = frame.centroids_px[:3]
+            assert not tracker.attempt(px, mag=frame.mag).ok
+    assert tried >= 10
 
 
 def test_sequences_without_sky_and_with_wrong_priors_have_no_answer(sky):

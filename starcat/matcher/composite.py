@@ -1,0 +1,135 @@
+"""Composites: the spots of successive frames without an answer, put together.
+
+Two frames of the same sky have stars in common, and differ by a turn of the camera. The turn is
+found from the spots alone: two spots of each frame with the same separation give a turn, and the
+turn that puts the most spots on each other is taken. The composite has the spots of all its frames
+in the camera frame of the last one. A spot that was seen again has the mean of its places, so the
+composite has more stars than a frame, and more accurate ones.
+
+No star of the database is looked at for this. So the places of a composite are random if those of
+its frames are, also if the same false spots are in each of them, and the bound on a false match is
+that of a frame with these spots (`starcat.matcher.chance`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
+from starcat.geometry.attitude import solve_wahba_svd
+from starcat.geometry.camera import Camera
+from starcat.matcher.observation import Observation
+from starcat.matcher.prior import turn_of_noise_rad
+
+SAME_SPOT = math.sqrt(2.0)
+"""Largest distance of two places of a spot, in tolerances: each of them has an error."""
+
+MOST_SEEDS = 24
+"""Number of spots of a frame, and of a composite, from which turns are found."""
+
+LEAST_SHARED = 3
+"""Smallest number of spots that two frames share: two of them determine the turn."""
+
+
+@dataclass(frozen=True)
+class Composite:
+    """Spots of successive frames, in the camera frame of the last one."""
+
+    body: Directions
+    mag: Array  # of the last frame that has the spot, NaN if not known
+    seen: NDArray[np.int64]  # number of frames that have it; 0: one, which is not the last one
+
+    def __len__(self) -> int:
+        return len(self.body)
+
+    def pixels(self, camera: Camera) -> tuple[Pixels, Array]:
+        """Return the places and the magnitudes of the spots that are in the frame of a camera."""
+        px = camera.pixels_from_directions(self.body)
+        inside = camera.contains(px)
+        return px[inside], self.mag[inside]
+
+
+def composite_of(frame: Observation) -> Composite:
+    """Return a composite of one frame."""
+    count = len(frame)
+    mag = np.full(count, np.nan) if frame.mag is None else frame.mag
+    return Composite(frame.body, mag, np.ones(count, dtype=int))
+
+
+def joined(before: Composite, frame: Observation, turn_rad: float) -> Composite | None:
+    """Return a composite with one more frame.
+
+    The camera may have turned by ``turn_rad`` and what noise adds to it. None if fewer than
+    `LEAST_SHARED` spots are at the same places after each such turn.
+    """
+    new, old = composite_of(frame), before.body
+    turn = _likeliest_turn(old[:MOST_SEEDS], new.body[:MOST_SEEDS], frame, turn_rad)
+    if turn is None:
+        return None
+    spots, again = _shared(old, new.body @ turn.T, frame)
+    if len(spots) < LEAST_SHARED:
+        return None
+    turn = solve_wahba_svd(old[spots], new.body[again])
+    spots, again = _shared(old, new.body @ turn.T, frame)
+    return None if len(spots) < LEAST_SHARED else _merged(before, new, turn, spots, again)
+
+
+def _likeliest_turn(
+    old: Directions, new: Directions, frame: Observation, turn_rad: float
+) -> Matrix | None:
+    """Return the turn that puts the most new spots on old ones, of those that two spots give.
+
+    It converts directions in the camera frame of the new spots into that of the old ones.
+    """
+    limit_rad = SAME_SPOT * frame.tolerance_rad
+    most_rad = turn_rad + turn_of_noise_rad(frame.camera, frame.tolerance_px)
+    i, j = np.nonzero(_squared_chords(old, new) <= (most_rad + limit_rad) ** 2)
+    first, second = np.triu_indices(len(i), 1)
+    old_sides, new_sides = (np.sqrt(_squared_chords(body, body)) for body in (old, new))
+    apart = old_sides[i[first], i[second]] - new_sides[j[first], j[second]]
+    is_pair = (i[first] != i[second]) & (j[first] != j[second])
+    is_pair &= np.abs(apart) <= SAME_SPOT * frame.side_tolerance_rad
+    pairs = np.stack([first[is_pair], second[is_pair]], axis=1)
+    turns = solve_wahba_svd(old[i[pairs]], new[j[pairs]])
+    turns = turns[np.trace(turns, axis1=1, axis2=2) >= 1.0 + 2.0 * math.cos(most_rad)]
+    if not len(turns):
+        return None
+    square = _squared_chords(new @ turns.swapaxes(1, 2), old).min(axis=1)
+    return np.asarray(turns[np.minimum(square, limit_rad**2).sum(axis=1).argmin()])
+
+
+def _shared(old: Directions, turned: Directions, frame: Observation) -> tuple[Rows, Rows]:
+    """Return the rows of the old spots that are seen again, and of the new spot nearest to each."""
+    square = _squared_chords(old, turned)
+    nearest = square.argmin(axis=1)
+    is_near = square.min(axis=1) <= (SAME_SPOT * frame.tolerance_rad) ** 2
+    return np.flatnonzero(is_near), nearest[is_near]
+
+
+def _merged(before: Composite, new: Composite, turn: Matrix, spots: Rows, again: Rows) -> Composite:
+    """Return the spots that are kept, in the camera frame of the new ones, and the other new ones.
+
+    A spot that was seen once, before the last frame, is dropped.
+    """
+    body, mag, seen = before.body.copy(), before.mag.copy(), before.seen.copy()
+    is_kept, is_other = seen > 0, np.ones(len(new), dtype=bool)
+    is_kept[spots], is_other[again] = True, False
+    seen[seen == 1] = 0
+    seen[spots] = np.maximum(before.seen[spots], 1) + 1
+    mag[spots] = new.mag[again]
+    body[spots] += (new.body[again] @ turn.T - body[spots]) / seen[spots, None]
+    body /= np.linalg.norm(body, axis=1)[:, None]
+    return Composite(
+        np.concatenate([body[is_kept] @ turn, new.body[is_other]]),
+        np.concatenate([mag[is_kept], new.mag[is_other]]),
+        np.concatenate([seen[is_kept], new.seen[is_other]]),
+    )
+
+
+def _squared_chords(a: Array, b: Array) -> Array:
+    """Return the squared distances of directions: shape (..., N, M) of (..., N, 3) and (M, 3)."""
+    return np.asarray(np.maximum(2.0 - 2.0 * (a @ b.T), 0.0))
