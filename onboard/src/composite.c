@@ -122,7 +122,7 @@ static int match_spots(const starcat_call *call, const starcat_composite *c,
 }
 
 /* Move the spots to the camera frame of the new frame, at their mean places, and drop those that
- * were seen once, before the last frame. Then add the other centroids. */
+ * were seen once, before the last frame, or are out of the field. Then add the other centroids. */
 static void merge_spots(const starcat_call *call, starcat_composite *c, const real m[9]) {
   starcat_workspace *w = call->work;
   uint32_t kept = 0;
@@ -151,7 +151,7 @@ static void merge_spots(const starcat_call *call, starcat_composite *c, const re
       c->body[kept][n] = scale * (m[n] * mean[0] + m[3u + n] * mean[1] + m[6u + n] * mean[2]);
     }
     c->seen[kept] = (uint16_t)seen;
-    kept += seen != DROPPED ? 1u : 0u;
+    kept += (seen != DROPPED) && (c->body[kept][2] >= call->camera.cos_radius) ? 1u : 0u;
   }
   for (uint32_t i = 0; i < call->own->count; i++) {
     if ((w->before[i] == 0) && (kept < STARCAT_MAX_CENTROIDS)) {

@@ -564,6 +564,15 @@ static void check_odd_composites(void) {
     composite.body[composite.n_spots][2] = (starcat_real)-1.0;
     composite.seen[composite.n_spots] = 2;
   }
+  CHECK(join_again(0.0, 0.01, &composite)); /* those behind the camera are dropped */
+  CHECK_IS(composite.n_spots, count);
+  for (; composite.n_spots < STARCAT_MAX_CENTROIDS; composite.n_spots++) {
+    const double angle = (double)composite.n_spots;
+    composite.body[composite.n_spots][0] = (starcat_real)(0.02 * cos(angle));
+    composite.body[composite.n_spots][1] = (starcat_real)(0.02 * sin(angle));
+    composite.body[composite.n_spots][2] = (starcat_real)cos(0.02);
+    composite.seen[composite.n_spots] = 2;
+  }
   detect(&whole, 1.0, 0); /* with other stars, for which there is no room */
   CHECK(truth.count > count);
   CHECK(join_again(0.0, 0.01, &composite));

@@ -75,7 +75,9 @@ def joined(before: Composite, frame: Observation, turn_rad: float) -> Composite 
         return None
     turn = solve_wahba_svd(old[spots], new.body[again])
     spots, again = _shared(old, new.body @ turn.T, frame)
-    return None if len(spots) < LEAST_SHARED else _merged(before, new, turn, spots, again)
+    if len(spots) < LEAST_SHARED:
+        return None
+    return _merged(before, new, turn, spots, again, frame.camera.radius_rad)
 
 
 def _likeliest_turn(
@@ -110,10 +112,12 @@ def _shared(old: Directions, turned: Directions, frame: Observation) -> tuple[Ro
     return np.flatnonzero(is_near), nearest[is_near]
 
 
-def _merged(before: Composite, new: Composite, turn: Matrix, spots: Rows, again: Rows) -> Composite:
+def _merged(
+    before: Composite, new: Composite, turn: Matrix, spots: Rows, again: Rows, radius_rad: float
+) -> Composite:
     """Return the spots that are kept, in the camera frame of the new ones, and the other new ones.
 
-    A spot that was seen once, before the last frame, is dropped.
+    A spot is dropped if it was seen once, before the last frame, or is out of the field.
     """
     body, mag, seen = before.body.copy(), before.mag.copy(), before.seen.copy()
     is_kept, is_other = seen > 0, np.ones(len(new), dtype=bool)
@@ -122,9 +126,10 @@ def _merged(before: Composite, new: Composite, turn: Matrix, spots: Rows, again:
     seen[spots] = np.maximum(before.seen[spots], 1) + 1
     mag[spots] = new.mag[again]
     body[spots] += (new.body[again] @ turn.T - body[spots]) / seen[spots, None]
-    body /= np.linalg.norm(body, axis=1)[:, None]
+    body = body / np.linalg.norm(body, axis=1)[:, None] @ turn
+    is_kept &= body[:, 2] >= math.cos(radius_rad)
     return Composite(
-        np.concatenate([body[is_kept] @ turn, new.body[is_other]]),
+        np.concatenate([body[is_kept], new.body[is_other]]),
         np.concatenate([mag[is_kept], new.mag[is_other]]),
         np.concatenate([seen[is_kept], new.seen[is_other]]),
     )

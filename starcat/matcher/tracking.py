@@ -229,7 +229,8 @@ class Tracker:
         self._time, made, self._attempted = now, self._attempted, None
         if found is None or not found.ok:
             self._gap = 1 if made is not None else self._gap + 1
-            self._composite = made or (self._composite if self._gap <= MAX_GAP else None)
+            if made is not None or self._gap > MAX_GAP:
+                self._composite = made
             return
         self._composite = None
         x, y, z, w = found.q_body_from_icrs.tolist()

@@ -107,6 +107,17 @@ def test_spots_that_are_seen_again_have_the_mean_of_their_places(sky):
     assert 0.2 * noise < np.sqrt(np.mean(apart**2)) < 0.5 * noise
 
 
+def test_spots_that_leave_the_field_are_dropped(sky):
+    generator, farthest = np.random.default_rng(5), math.cos(sky.camera.radius_rad)
+    turn = matrix_from_quaternion(np.array(after_turn((0.0, 0.0, 0.0, 1.0), (0.01, 0.0, 0.0))))
+    truth, composite = _directions(sky, 12, generator), None
+    for _ in range(40):
+        frame = _observed(sky, truth)
+        composite = composite_of(frame) if composite is None else joined(composite, frame, 0.02)
+        assert (composite.body[:, 2] >= farthest).all()
+        truth = np.concatenate([truth @ turn.T, _directions(sky, 1, generator)])
+
+
 def test_frames_that_share_no_spots_are_not_joined(sky):
     generator, made = np.random.default_rng(7), 0
     for _ in range(40):
