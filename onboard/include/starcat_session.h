@@ -241,13 +241,13 @@ starcat_status starcat_test_self(starcat_session *session, starcat_answer *answe
 /* Identify a frame. If the last attitude is fresh at `time`, the frame is tracked first; if it is
  * not, or if tracking fails, the frame is identified lost in space. With `correct` the attitude is
  * fitted to corrected centroids. An attitude that is found becomes the last attitude. A frame
- * without one changes only counts and the composite of such frames: the last attitude is used until its
- * age ends it. Without an image: why there is none, and STARCAT_MODE_NONE.
+ * without one changes only counts and the composite of such frames: the last attitude is used until
+ * its age ends it. Without an image: why there is none, and STARCAT_MODE_NONE.
  *
  * With max_steps_confirm the spots of refused frames are put together, if each frame follows the one
- * before it within prior_age, and by a turn of at most prior_error_rad. If they have an attitude
- * together, and the last frame has one near it, that frame is answered. Its log_chance is the larger
- * one of both. fov_error has to be 0. */
+ * before it within prior_age, and by a turn of at most prior_error_rad, or 0.175 if that is more. If
+ * they have an attitude together, and the last frame has one near it, that frame is answered. Its
+ * log_chance is the larger one of both. fov_error has to be 0. */
 starcat_status starcat_answer_frame(starcat_session *session, const starcat_frame *frame,
                                     uint64_t time, starcat_answer *answer);
 

@@ -11,7 +11,7 @@
 #define BLOCKS_OF_PARITY_CHECK 4u /* a group takes at most as long as this many blocks */
 #define MOST_BLOCKS_PER_TICK 65536u
 #define CORRECTED_RAD R(1e-3) /* largest change of the attitude by correcting a frame */
-#define MOST_TURN_RAD R(0.175) /* between refused frames: half of the widest prior */
+#define MOST_TURN_RAD (R(0.5) * MOST_PRIOR_ERROR_RAD) /* between refused frames */
 
 /* Settings and the session itself. */
 
