@@ -12,7 +12,7 @@
 #define SAME_SPOT R(1.4142135623730950488) /* largest distance of two places, in tolerances */
 #define MOST_SEEDS 24u                      /* spots of each from which turns are found */
 #define LEAST_SHARED 3u                     /* spots that two frames share; two give the turn */
-#define DROPPED 65535u                      /* number of frames that have a spot that is not kept */
+#define MOST_SEEN 1000u                     /* frames in the mean of the places of a spot */
 
 /* Limits of the distances of the spots of a composite and a frame. */
 typedef struct {
@@ -121,49 +121,60 @@ static int match_spots(const starcat_call *call, const starcat_composite *c,
   return starcat_spend_steps(call, count * c->n_spots) && (shared >= LEAST_SHARED);
 }
 
-/* Move the spots to the camera frame of the new frame, at their mean places, and drop those that
- * were seen once, before the last frame, or are out of the field. Then add the other centroids. */
+/* Turn a direction in the camera frame of the composite to that of the new frame. */
+static void turn_back(const real m[9], const real v[3], real turned[3]) {
+  const real scale = R(1.0) / STARCAT_SQRT(starcat_dot(v, v));
+  for (uint32_t n = 0; n < 3u; n++) {
+    turned[n] = scale * (m[n] * v[0] + m[3u + n] * v[1] + m[6u + n] * v[2]);
+  }
+}
+
+static void copy_spot(starcat_composite *c, uint32_t k, const real body[3], real magnitude,
+                      uint32_t seen) {
+  for (uint32_t n = 0; n < 3u; n++) {
+    c->body[k][n] = body[n];
+  }
+  c->magnitude[k] = magnitude;
+  c->seen[k] = (uint16_t)seen;
+}
+
+/* Make the composite of the centroids in their order, at the mean places of the spots that they
+ * are, and then of the spots that are kept. One that is not seen again is dropped if it was seen
+ * once, before the last frame, or is out of the field, or has no room. */
 static void merge_spots(const starcat_call *call, starcat_composite *c, const real m[9]) {
   starcat_workspace *w = call->work;
+  const uint32_t count = call->own->count;
   uint32_t kept = 0;
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    w->before[i] = 0;
+  for (uint32_t i = 0; i < count; i++) {
+    w->before[i] = 1;
   }
   for (uint32_t k = 0; k < c->n_spots; k++) {
     const uint32_t i = starcat_limit_place(w->seen[k], STARCAT_MAX_CENTROIDS);
-    uint32_t seen = c->seen[k];
-    real mean[3] = {c->body[k][0], c->body[k][1], c->body[k][2]};
-    c->magnitude[kept] = c->magnitude[k];
-    if (w->weight[k] > R(0.0)) {
-      seen += seen > 0u ? 1u : 2u;
+    const uint32_t seen = c->seen[k];
+    if (!(w->weight[k] > R(0.0))) {
+      real turned[3];
+      turn_back(m, c->body[k], turned);
+      copy_spot(c, kept, turned, c->magnitude[k], seen > 1u ? seen : 0u);
+      kept += (seen > 0u) && (turned[2] >= call->camera.cos_radius) ? 1u : 0u;
+    } else if (w->before[i] == 1) {
+      real mean[3] = {c->body[k][0], c->body[k][1], c->body[k][2]};
+      w->before[i] = (int16_t)(seen == 0u ? 2u : (seen < MOST_SEEN ? seen + 1u : MOST_SEEN));
       for (uint32_t n = 0; n < 3u; n++) {
-        mean[n] += (w->seen_icrs[i][n] - mean[n]) / (real)seen;
+        mean[n] += (w->seen_icrs[i][n] - mean[n]) / (real)w->before[i];
       }
-      c->magnitude[kept] = w->magnitude[i];
-      w->before[i] = 1;
-    } else if (seen < 2u) {
-      seen = seen > 0u ? 0u : DROPPED;
+      turn_back(m, mean, w->body[i]);
     } else {
-      /* seen by several frames */
-    }
-    const real scale = R(1.0) / STARCAT_SQRT(starcat_dot(mean, mean));
-    for (uint32_t n = 0; n < 3u; n++) {
-      c->body[kept][n] = scale * (m[n] * mean[0] + m[3u + n] * mean[1] + m[6u + n] * mean[2]);
-    }
-    c->seen[kept] = (uint16_t)seen;
-    kept += (seen != DROPPED) && (c->body[kept][2] >= call->camera.cos_radius) ? 1u : 0u;
-  }
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    if ((w->before[i] == 0) && (kept < STARCAT_MAX_CENTROIDS)) {
-      for (uint32_t n = 0; n < 3u; n++) {
-        c->body[kept][n] = w->body[i][n];
-      }
-      c->magnitude[kept] = w->magnitude[i];
-      c->seen[kept] = 1;
-      kept++;
+      /* the centroid is a spot already */
     }
   }
-  c->n_spots = kept;
+  kept = kept < (STARCAT_MAX_CENTROIDS - count) ? kept : (STARCAT_MAX_CENTROIDS - count);
+  c->n_spots = count + kept;
+  for (uint32_t k = kept; k > 0u; k--) {
+    copy_spot(c, count + k - 1u, c->body[k - 1u], c->magnitude[k - 1u], c->seen[k - 1u]);
+  }
+  for (uint32_t i = 0; i < count; i++) {
+    copy_spot(c, i, w->body[i], w->magnitude[i], (uint32_t)w->before[i]);
+  }
 }
 
 /* Add a frame to a composite, after a turn of the camera by at most `turn_rad`. Returns whether the

@@ -535,6 +535,9 @@ static void check_joined_frames(void) {
   truth.count -= 2; /* two are not there */
   CHECK(join_again(0.0, 0.01, &composite));
   CHECK_IS(composite.n_spots, truth.count + 2u);
+  for (uint32_t i = 0; i < composite.n_spots; i++) { /* those of the frame are first */
+    CHECK_IS(composite.seen[i], i < truth.count ? 5u : 4u);
+  }
   CHECK(!join_again(0.006, 0.002, &composite)); /* farther than the turn that is allowed */
   CHECK_IS(composite.n_spots, truth.count);
   for (uint32_t i = 0; i < composite.n_spots; i++) {
@@ -548,6 +551,15 @@ static void check_joined_frames(void) {
   CHECK_IS(composite.n_spots, truth.count);
   for (uint32_t i = 0; i < composite.n_spots; i++) {
     CHECK_IS(composite.seen[i], 2);
+    composite.seen[i] = 1000;
+  }
+  for (uint32_t k = 0; k < 3u; k++) { /* two spots where the frame has one */
+    composite.body[1][k] = composite.body[0][k];
+  }
+  CHECK(join_again(0.0, 0.01, &composite));
+  CHECK_IS(composite.n_spots, truth.count);
+  for (uint32_t i = 0; i < composite.n_spots; i++) {
+    CHECK_IS(composite.seen[i], i == 1u ? 1u : 1000u);
   }
 }
 

@@ -34,10 +34,16 @@ MOST_SEEDS = 24
 LEAST_SHARED = 3
 """Smallest number of spots that two frames share: two of them determine the turn."""
 
+MOST_SEEN = 1000
+"""Largest number of frames in the mean of the places of a spot."""
+
 
 @dataclass(frozen=True)
 class Composite:
-    """Spots of successive frames, in the camera frame of the last one."""
+    """Spots of successive frames, in the camera frame of the last one.
+
+    Those of the last frame are first, in its order, which may be that of their brightness.
+    """
 
     body: Directions
     mag: Array  # of the last frame that has the spot, NaN if not known
@@ -115,23 +121,24 @@ def _shared(old: Directions, turned: Directions, frame: Observation) -> tuple[Ro
 def _merged(
     before: Composite, new: Composite, turn: Matrix, spots: Rows, again: Rows, radius_rad: float
 ) -> Composite:
-    """Return the spots that are kept, in the camera frame of the new ones, and the other new ones.
+    """Return the new spots in their order, and then the old ones that are kept.
 
-    A spot is dropped if it was seen once, before the last frame, or is out of the field.
+    An old spot that is not seen again is dropped if it was seen once, before the last frame, or is
+    out of the field.
     """
-    body, mag, seen = before.body.copy(), before.mag.copy(), before.seen.copy()
-    is_kept, is_other = seen > 0, np.ones(len(new), dtype=bool)
-    is_kept[spots], is_other[again] = True, False
-    seen[seen == 1] = 0
-    seen[spots] = np.maximum(before.seen[spots], 1) + 1
-    mag[spots] = new.mag[again]
-    body[spots] += (new.body[again] @ turn.T - body[spots]) / seen[spots, None]
-    body = body / np.linalg.norm(body, axis=1)[:, None] @ turn
-    is_kept &= body[:, 2] >= math.cos(radius_rad)
+    again, first = np.unique(again, return_index=True)
+    seen, body = new.seen.copy(), new.body.copy()
+    seen[again] = np.minimum(np.maximum(before.seen[spots[first]], 1) + 1, MOST_SEEN)
+    mean = before.body[spots[first]]
+    mean += (new.body[again] @ turn.T - mean) / seen[again, None]
+    body[again] = mean / np.linalg.norm(mean, axis=1)[:, None] @ turn
+    old = before.body @ turn
+    is_kept = (before.seen > 0) & (old[:, 2] >= math.cos(radius_rad))
+    is_kept[spots] = False
     return Composite(
-        np.concatenate([body[is_kept], new.body[is_other]]),
-        np.concatenate([mag[is_kept], new.mag[is_other]]),
-        np.concatenate([seen[is_kept], new.seen[is_other]]),
+        np.concatenate([body, old[is_kept]]),
+        np.concatenate([new.mag, before.mag[is_kept]]),
+        np.concatenate([seen, np.where(before.seen == 1, 0, before.seen)[is_kept]]),
     )
 
 

@@ -118,6 +118,28 @@ def test_spots_that_leave_the_field_are_dropped(sky):
         truth = np.concatenate([truth @ turn.T, _directions(sky, 1, generator)])
 
 
+def test_a_turn_through_many_stars_is_followed_by_the_brightest_of_each_frame(sky):
+    # The stars have no magnitudes, and the brightest are first.
+    generator = np.random.default_rng(11)
+    stars = generator.normal(size=(9000, 3))
+    stars /= np.linalg.norm(stars, axis=1)[:, None]
+    turn_rad, composite = 0.15 * sky.camera.radius_rad, None
+    turn = matrix_from_quaternion(np.array(after_turn((0.0, 0.0, 0.0, 1.0), (turn_rad, 0.0, 0.0))))
+    for _ in range(20):
+        px = sky.camera.pixels_from_directions(stars)
+        is_seen = sky.camera.contains(px) & (stars[:, 2] > 0.0)
+        frame = observe(as_frame(px[is_seen], sky.camera), Settings(noise_px=1.0))
+        assert len(frame) > 40
+        if composite is None:
+            composite = composite_of(frame)
+        else:
+            composite = joined(composite, frame, 2.0 * turn_rad)
+            assert composite is not None
+            assert (composite.seen[: len(frame)] >= 1).all()
+            assert (composite.seen >= 2).sum() >= 0.7 * len(frame)
+        stars = stars @ turn.T
+
+
 def test_frames_that_share_no_spots_are_not_joined(sky):
     generator, made = np.random.default_rng(7), 0
     for _ in range(40):

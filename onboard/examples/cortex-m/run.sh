@@ -30,6 +30,7 @@ bytes_of() { arm-none-eabi-size "$@" | awk 'NR > 1 { sum += $1 + $2 + $3 } END {
 run_on() {
   name=$1 machine=$2 processor="$3 -mthumb -mfloat-abi=hard -Os -ffunction-sections -fdata-sections"
   echo "$name, $machine of qemu, single precision, -Os"
+  rm -rf "${out:?}/$name"
   mkdir -p "$out/$name"
   for source in src/*.c; do
     arm-none-eabi-gcc $STRICT $processor $single -Wdouble-promotion -Iinclude -c "$source" \
@@ -41,9 +42,9 @@ run_on() {
     $here/main.c $here/start.c $here/image.S "$out/$name"/*.o -T $here/flash.ld -nostartfiles \
     --specs=nano.specs --specs=rdimon.specs -lm \
     -Wl,--gc-sections,--print-memory-usage,-Map="$out/$name/map.txt" -o "$out/$name/tracker.elf"
-  core=$(ls "$out/$name"/*.o | grep -v -e /update.o -e /session.o)
+  core=$(ls "$out/$name"/*.o | grep -v -e /update.o -e /session.o -e /composite.o)
   echo "code and constants of the library: $(bytes_of $core) bytes," \
-    "with update.c and session.c: $(bytes_of "$out/$name"/*.o) bytes"
+    "with images in flight and sessions: $(bytes_of "$out/$name"/*.o) bytes"
   timeout 120 qemu-system-arm -machine "$machine" -nographic -semihosting -icount shift=0 \
     -kernel "$out/$name/tracker.elf" >"$out/$name/said.txt" 2>&1 </dev/null ||
     { cat "$out/$name/said.txt"; echo "microcontroller: it ended badly on $name"; exit 1; }
