@@ -183,7 +183,8 @@ def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
         return [(name, f"{value:.4f}")]
     if value is None or isinstance(value, list | dict):
         return []
-    return [(name, f"{value:.9g}" if isinstance(value, float) else value)]
+    digits = 2 if name.endswith("_probability") else 6
+    return [(name, f"{value:.{digits}g}" if isinstance(value, float) else value)]
 
 
 def _rows_of_shape(shape: FrameShape) -> list[tuple[str, str]]:

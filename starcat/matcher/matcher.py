@@ -304,26 +304,10 @@ class Matcher:
                 )
         return fields_deg
 
-    def _search_other(
-        self, frame: MeasuredFrame, fov_error: float, camera: Camera, time_limit_s: float
-    ) -> MatchResult:
-        """Identify a frame that was turned, or with another camera, within a time."""
-        return self.within(time_limit_s, camera, fov_error).identify(
-            frame.centroids_px, camera,
-            mag=frame.mag, sigma_px=frame.sigma_px, fov_error=fov_error,
-        )  # fmt: skip
-
-    def within(
-        self, time_limit_s: float, camera: Camera, fov_error: float, *, is_range: bool = False
-    ) -> Matcher:
-        """Return a matcher whose searches with numpy end after a time; C has its own limit.
-
-        ``is_range`` is whether it is to search a range of fields, which C does not.
-        """
-        in_c = not is_range and self._in_c(camera, fov_error) is not None
-        if in_c or time_limit_s >= self.settings.time_limit_s:
-            return self
-        return self.with_settings(time_limit_s=time_limit_s)
+    def _search_other(self, frame: MeasuredFrame, fov_error: float, camera: Camera) -> MatchResult:
+        """Identify a frame that was turned, or with another camera."""
+        px, mag, sigma_px = frame.centroids_px, frame.mag, frame.sigma_px
+        return self.identify(px, camera, mag=mag, sigma_px=sigma_px, fov_error=fov_error)
 
     def _search(
         self,

@@ -7,7 +7,6 @@ on false matches like an answer, with all searches of the frame counted.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -39,17 +38,12 @@ PARTS = 2
 """Parts on each side of the first one. An error of the focal length bends the sides of triangles:
 the smaller the part, the fewer triangles are similar by chance."""
 
-TIME_S = 2.0
-"""Largest processor time of all these attempts, seconds. No search begins that would exceed it if
-it took as long as the longest search before."""
-
 SEARCHES = 2
 """Number of searches before, if the caller does not count them: as stated, and with an error."""
 
 
-Search = Callable[[MeasuredFrame, float, Camera, float], MatchResult]
-"""The answer to a frame: arguments are the frame, the error of its focal length, its camera and a
-time limit in seconds."""
+Search = Callable[[MeasuredFrame, float, Camera], MatchResult]
+"""The answer to a frame: arguments are the frame, the error of its focal length, and its camera."""
 
 
 def parts_of_fields(camera: Camera) -> list[tuple[Camera, float]]:
@@ -88,23 +82,23 @@ def explained(
     """Return a refused answer with the findings of a second look.
 
     The frame is tried mirrored, with x and y exchanged unless it ``is_picture``, and,
-    ``with_fields``, in fields of half to twice the stated one, the nearest first, for `TIME_S` in
-    all. The probability that chance agrees in any of K searches is at most the sum
-    of their K probabilities. ``searches`` is the number of searches of the frame so far; a finding
-    is left out if its probability times the number of all searches is above the ``limit``.
+    ``with_fields``, in fields of half to twice the stated one, the nearest first. The probability
+    that chance agrees in any of K searches is at most the sum of their K probabilities.
+    ``searches`` is the number of searches of the frame so far; a finding is left out if its
+    probability times the number of all searches is above the ``limit``.
     """
     refusal = refused.refusal
     if refusal is None:
         return refused
     parts = parts_of_fields(camera) if with_fields else []
-    count, timer = searches + (1 if is_picture else 2) + len(parts), _Time()
-    up = timer.of(search, upside_down(frame, camera.height_px), fov_error, camera)
+    count = searches + (1 if is_picture else 2) + len(parts)
+    up = search(upside_down(frame, camera.height_px), fov_error, camera)
     is_up, is_exchanged = _is_certain(up, limit / count), False
     # With x and y exchanged a frame is mirrored, too. On a square detector both readings fit, and
     # only the roll differs; on another one the centroids leave the frame.
     turned = exchanged(frame)
     if not is_picture and (is_up or _n_inside(turned, camera) > _n_inside(frame, camera)):
-        other = timer.of(search, turned, fov_error, camera)
+        other = search(turned, fov_error, camera)
         is_exchanged = _is_certain(other, limit / count)
         if is_exchanged and (not is_up or other.n_matched > up.n_matched):
             return replace(refused, refusal=_explanation(other, "exchanged", count, None, camera))
@@ -113,12 +107,8 @@ def explained(
         why = _explanation(up, "mirrored", count, None, camera)
         rolls_deg = (up.roll_deg, other.roll_deg) if is_exchanged else None
         return replace(refused, refusal=replace(why, flip=flip, rolls_deg=rolls_deg))
-    tried = []
     for part, error in parts:
-        if timer.is_over:
-            break
-        answer = timer.of(search, frame, error, part)
-        tried += [part.focal_length_px * (1.0 - error), part.focal_length_px / (1.0 - error)]
+        answer = search(frame, error, part)
         if answer.camera is not None and _is_certain(answer, limit / count):
             factor = answer.camera.focal_length_px / camera.focal_length_px
             is_near = abs(factor - 1.0) <= WIDE_FOV_ERROR
@@ -126,27 +116,15 @@ def explained(
                 answer, "scale" if is_near else "other_field", count, factor - 1.0, camera
             )
             return replace(refused, refusal=why)
-    fields = [2.0 * math.degrees(math.atan(0.5 * camera.width_px / focal)) for focal in tried]
+    tangents = [
+        0.5 * camera.width_px / part.focal_length_px * factor
+        for part, error in parts
+        for factor in (1.0 - error, 1.0 / (1.0 - error))
+    ]
+    fields = [2.0 * math.degrees(math.atan(tangent)) for tangent in tangents]
     facts: frozenset[Fact] = refusal.facts | frozenset[Fact](("explained",))
     between = (min(fields), max(fields)) if fields else None
     return replace(refused, refusal=replace(refusal, facts=facts, tried_fov_deg=between))
-
-
-class _Time:
-    """The time that is left for a second look."""
-
-    def __init__(self) -> None:
-        self._end_s, self._longest_s = time.thread_time() + TIME_S, 0.0
-
-    @property
-    def is_over(self) -> bool:
-        return time.thread_time() + self._longest_s > self._end_s
-
-    def of(self, search: Search, frame: MeasuredFrame, error: float, camera: Camera) -> MatchResult:
-        before_s = time.thread_time()
-        answer = search(frame, error, camera, max(1e-3, self._end_s - before_s))
-        self._longest_s = max(self._longest_s, time.thread_time() - before_s)
-        return answer
 
 
 def _n_inside(frame: MeasuredFrame, camera: Camera) -> int:

@@ -273,22 +273,18 @@ class FileAnswers:
                 hint="leave out {track:True} and {prior_q}",
             )
 
-    def _search(
-        self, frame: MeasuredFrame, fov_error: float, camera: Camera, time_limit_s: float = math.inf
-    ) -> MatchResult:
+    def _search(self, frame: MeasuredFrame, fov_error: float, camera: Camera) -> MatchResult:
         """Identify a frame: in the whole sky, near an attitude, or along a sequence."""
         arguments: dict[str, Any] = {
             "camera": camera, "fov_error": fov_error, "sigma_px": frame.sigma_px,
         }  # fmt: skip
         if self.tracker is not None:
             return self.tracker.attempt(frame.centroids_px, mag=frame.mag, **arguments)
-        is_range = self.options.fov_deg is not None
-        matcher = self.matcher.within(time_limit_s, camera, fov_error, is_range=is_range)
         prior, error_deg = self._prior or (None, None)
         arguments |= {
             "fov_deg": self.options.fov_deg, "prior": prior, "prior_error_deg": error_deg,
         }  # fmt: skip
-        return matcher.identify(frame.centroids_px, mag=frame.mag, **arguments)
+        return self.matcher.identify(frame.centroids_px, mag=frame.mag, **arguments)
 
     def notes(self, first: FrameAnswer | None) -> list[str]:
         """Return notes for the user in addition to the answers."""
