@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import shutil
 import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -342,6 +344,24 @@ def test_a_starved_process_is_not_told_to_send_less(tmp_path, fraction, words, s
         sandbox._answer(Starved(fraction), ["identify", {}, 0.1])
     assert problem_of(caught.value).status == status
     assert (time.monotonic() - began_s > 0.28) == (status == 503), "it had more time"
+    sandbox.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_process_has_no_thread_for_each_processor(tmp_path, small_database, monkeypatch):
+    # Each thread reserves 8 MB, or 40 MB: those of 64 processors take more than a task may.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.setenv(name, "64")
+    sandbox = Sandbox(ServiceSettings(root=tmp_path), tmp_path)
+    image = {
+        "database": str(small_database), "target": str(tmp_path / "sky.img"),
+        "method": None, "endian": "little", "profile": "full",
+    }  # fmt: skip
+    assert sandbox.call("flight_image", image) == (tmp_path / "sky.img").stat().st_size
+    with sandbox._children.lend(None) as worker:
+        status = Path(f"/proc/{worker.pid}/status").read_text(encoding="ascii")
+    threads = re.search(r"Threads:\t(\d+)", status)
+    assert int(threads[1]) <= 12, "of Arrow, most of them for input and output"
     sandbox.close()
 
 

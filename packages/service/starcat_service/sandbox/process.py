@@ -37,6 +37,14 @@ PATIENT = 19
 _TICKS = os.sysconf("SC_CLK_TCK") if os.name == "posix" else 1
 
 
+_LEAN = {
+    # Arrow's own allocators reserve gigabytes, and each thread of OpenBLAS 40 MB. All of it counts
+    # as used memory, and by default there are as many threads as processors.
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+
+
 class WorkerProcess:
     """A process with the same Python that calls a function, which answers requests.
 
@@ -64,8 +72,7 @@ class WorkerProcess:
             stdout=subprocess.PIPE,
             stderr=stderr,
             start_new_session=has_group,
-            # Arrow's own allocators reserve gigabytes, which count as used memory.
-            env={**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system", **(environment or {})},
+            env={**os.environ, **_LEAN, **(environment or {})},
         )
         self._requests, self._replies = _pipe(self._process.stdin), _pipe(self._process.stdout)
         if os.name == "posix":

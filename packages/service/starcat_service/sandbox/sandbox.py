@@ -113,6 +113,7 @@ class Sandbox:
                 "MPLCONFIGDIR": str(self._scratch / "matplotlib"),
                 "TMPDIR": str(self._scratch),
                 "MALLOC_ARENA_MAX": "2",  # each arena keeps memory that the others cannot use
+                "OMP_NUM_THREADS": "2",  # of Arrow; the stack of each thread counts as memory
             },
         )
         with suppress(OSError):  # the next request notices that it ended
