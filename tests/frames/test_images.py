@@ -151,6 +151,29 @@ def test_centroids_do_not_follow_the_pixel_grid(sigma):
     assert np.abs(error).max() < 0.02
 
 
+@pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5])
+def test_stars_that_the_border_cuts_are_where_they_are(sigma):
+    # One after the other along each side; two thirds to all of their light is in the image.
+    depth = np.linspace(0.5, 4.0, 20)
+    along, last = 12.3 + 24.1 * np.arange(20), 500.0
+    places = np.concatenate(
+        [np.stack(xy, 1) for xy in ((depth, along), (last - depth, along), (along, depth))]
+    )
+    mean = star_electrons(places, np.full(60, 3.0), (500, 500), Optics(psf_sigma_px=sigma))
+    spots = find_spots(mean, psf_sigma_px=sigma)
+    index = found_at(spots, places)
+    error = spots.centroids_px[index] - places
+    assert np.abs(error).max() < 0.05, "up to 0.7 px if nothing is corrected"
+    assert np.ptp(spots.mag[index]) < 0.12
+    # The error that noise makes grows with the part that is outside.
+    noisy = render_image(places, np.full(60, 7.0), (500, 500), Optics(psf_sigma_px=sigma), 8)
+    spots = find_spots(noisy, psf_sigma_px=sigma)
+    index = found_at(spots, places)
+    ratio = (spots.centroids_px[index] - places) / spots.sigma_px[index, None]
+    assert np.sqrt((ratio**2).mean()) < 1.3
+    assert spots.sigma_px[index[0]] > 1.5 * spots.sigma_px[index[19]]
+
+
 def cramer_rao_px(electrons: float, optics: Optics) -> float:
     """Return the least error of an unbiased centroid, one axis, by Fisher's information."""
     mag, step = np.array([-2.5 * np.log10(electrons / optics.zero_point_e)]), 1e-3

@@ -35,6 +35,7 @@ from starcat.frames.images.spots import (
     is_sharp,
     noise_at,
     sigma_of_stars,
+    undo_border,
 )
 from starcat.frames.images.streaks import Streak, measured_streaks, refined, streak_of
 
@@ -140,8 +141,15 @@ def _measured(
     x, y = (centroids - 0.5).T
     radius = APERTURE_SIGMA * seen
     part, _, _ = load_sep().sum_circle(levels.above, x, y, radius, mask=levels.mask, subpix=0)
-    flux = part / (1.0 - np.exp(-0.5 * APERTURE_SIGMA**2))
-    sigma_px = centroid_sigma_px(flux, noise_at(levels, centroids), seen, gain, window)
+    flux, growth = part / (1.0 - np.exp(-0.5 * APERTURE_SIGMA**2)), np.ones(len(part))
+    for axis, length_px in enumerate(levels.raw.shape[::-1]):
+        place = centroids[:, axis]
+        is_far = place > 0.5 * length_px
+        depth = np.where(is_far, length_px - place, place)
+        depth, larger, share = undo_border(depth, sigma, window)
+        centroids[:, axis] = np.where(is_far, length_px - depth, depth)
+        flux, growth = flux / share, np.maximum(growth, larger)
+    sigma_px = growth * centroid_sigma_px(flux, noise_at(levels, centroids), seen, gain, window)
     return _in_order(centroids, flux, sigma_px, sigma, most)
 
 
@@ -173,11 +181,15 @@ def _is_saturated(levels: SkyLevels, detections: NDArray[Any]) -> Mask:
 
 
 def _windowed(levels: SkyLevels, detections: NDArray[Any], window: float) -> Array:
-    """Return windowed centroids; a barycentre if the window drifts to a neighbouring spot."""
+    """Return windowed centroids; a barycentre if the window drifts to a neighbouring spot.
+
+    The window of a spot that the border cuts drifts, too: towards the middle of the spot.
+    """
     start = np.stack([detections["x"], detections["y"]], axis=1)
     x, y, _ = load_sep().winpos(levels.above, *start.T, window, mask=levels.mask, subpix=0)
     centroids = np.stack([x, y], axis=1)
-    is_blended = (detections["flag"] & load_sep().OBJ_MERGED) > 0
+    merged, cut = load_sep().OBJ_MERGED, load_sep().OBJ_TRUNC
+    is_blended = (detections["flag"] & (merged | cut)) == merged
     drifts = is_blended & (np.hypot(*(centroids - start).T) > 0.5 * window)
     # sep counts from the centre of the first pixel.
     return np.asarray(np.where(drifts[:, None], start, centroids) + 0.5, dtype=np.float64)

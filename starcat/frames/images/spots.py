@@ -9,11 +9,15 @@ import scipy
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask, Pixels
+from starcat.database.products.blends import PIXEL_VARIANCE
 from starcat.frames.images.background import SkyLevels, pixels_around, unmasked
 from starcat.matcher.result import MatchResult
 
 CREDIBLE_CHI_SQUARE = (0.5, 2.0)
 """Range of an answer's reduced chi-square in which the noise of its spots gives their weights."""
+
+_BORDER_STEPS = 12  # of Newton's method, for spots of which a tenth is in the image
+_FARTHEST_OUTSIDE = -4.0  # middle of a spot outside of the image, in its widths
 
 MIN_DEPTH = 2.0
 """Smallest depth of the darkest pixel below a sky that was not clipped, standard deviations."""
@@ -40,6 +44,36 @@ def centroid_sigma_px(
     of_sky = 0.5 * np.pi * window**2 * (noise / bright) ** 2
     of_photons = (window / (window + 2.0 * spot)) ** 2 * spot / (bright * gain_e_per_adu)
     return np.asarray(np.nan_to_num(np.sqrt(of_sky + of_photons) / slope, nan=np.inf))
+
+
+def undo_border(
+    depth_px: Array, psf_sigma_px: float, window_px: float
+) -> tuple[Array, Array, Array]:
+    """Return where spots are that the border of the image cuts, along an axis.
+
+    ``depth_px`` are the distances of windowed centroids from the border. The spot, before pixels
+    sample it, and the window are Gaussians, so their product is one, too; pixels widen the window.
+    The centroid is the mean of the part of the product that is in the image, and lies farther
+    inside than the spot. Returns the distances of the spots from the border (0 if they would be
+    outside), how many times larger their errors are than those of centroids, and the share of the
+    light that is in the image.
+
+    >>> depth_px, growth, share = undo_border(np.array([1.113, 9.0]), 1.2, 1.234)
+    >>> depth_px.round(2).tolist(), growth.round(1).tolist(), share.round(2).tolist()
+    ([0.63, 9.0], [2.1, 1.0], [0.7, 1.0])
+    """
+    spot, window = psf_sigma_px**2, window_px**2 + PIXEL_VARIANCE
+    width = np.sqrt(spot * window / (spot + window))
+    mean = np.maximum(depth_px, 0.0) / width  # of the part in the image, in widths
+    middle = mean.copy()  # of the whole product, from which the mean is `pull` away
+    for _ in range(_BORDER_STEPS):
+        pull = np.exp(-0.5 * middle**2 - scipy.special.log_ndtr(middle)) / np.sqrt(2.0 * np.pi)
+        slope = 1.0 - pull * (middle + pull)
+        middle = np.clip(middle - (middle + pull - mean) / slope, _FARTHEST_OUTSIDE, mean)
+    depth = (middle * width * (spot + window) - depth_px * spot) / window
+    growth = ((spot + window) / slope - spot) / window
+    depth = np.where(depth_px > 0.0, np.maximum(depth, 0.0), depth_px)
+    return depth, growth, scipy.special.ndtr(depth / psf_sigma_px)
 
 
 def noise_at(levels: SkyLevels, centroids_px: Pixels) -> Array:
