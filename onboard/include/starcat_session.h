@@ -148,7 +148,7 @@ typedef struct {
   uint32_t frames_refused;           /* invalid number of centroids, options or camera */
   uint32_t errors[STARCAT_N_ERRORS]; /* frames_refused by status: STARCAT_E_NULL is the first */
   uint32_t tracks_failed;            /* tracked in vain: a wrong prior, or a bad frame */
-  uint32_t tracks_refused;           /* of these: too many stars within prior_error_rad */
+  uint32_t tracks_refused; /* too many stars within prior_error_rad, or twice that to confirm */
   uint32_t most_steps_track;         /* high-water marks */
   uint32_t most_steps_identify;
   uint32_t most_steps_confirm;

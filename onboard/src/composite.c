@@ -23,10 +23,12 @@ typedef struct {
   uint32_t n_old, n_new; /* spots from which turns are found */
 } spot_limits;
 
-/* Turn the first centroids to the camera frame of the composite, in `seen_icrs`. */
+/* Turn the first centroids to the camera frame of the composite, in `seen_icrs`. None of them is a
+ * spot yet, in `before`. */
 static void turn_centroids(const starcat_call *call, uint32_t count, const real m[9]) {
   for (uint32_t i = 0; i < count; i++) {
     starcat_turn(m, call->work->body[i], call->work->seen_icrs[i]);
+    call->work->before[i] = 0;
   }
 }
 
@@ -96,8 +98,8 @@ static int find_likeliest_turn(const starcat_call *call, const starcat_composite
   return (has_steps != 0) && (least < none);
 }
 
-/* Find the centroid of each spot, the nearest one; its weight is 0 without one. Returns whether they
- * are enough, and steps are left. */
+/* Find the centroid of each spot, the nearest one; its weight is 0 without one. Returns whether the
+ * centroids are enough, and steps are left. */
 static int match_spots(const starcat_call *call, const starcat_composite *c,
                        const spot_limits *most, const real m[9]) {
   starcat_workspace *w = call->work;
@@ -116,7 +118,10 @@ static int match_spots(const starcat_call *call, const starcat_composite *c,
         w->weight[k] = R(1.0);
       }
     }
-    shared += w->weight[k] > R(0.0) ? 1u : 0u;
+    if (w->weight[k] > R(0.0)) {
+      shared += w->before[w->seen[k]] == 0 ? 1u : 0u;
+      w->before[w->seen[k]] = 1;
+    }
   }
   return starcat_spend_steps(call, count * c->n_spots) && (shared >= LEAST_SHARED);
 }

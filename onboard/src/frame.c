@@ -45,7 +45,7 @@ starcat_status starcat_check_options(const starcat_options *o) {
 static int comes_before(const starcat_call *call, real magnitude, real square, real x, real y,
                         uint32_t other) {
   const starcat_workspace *w = call->work;
-  if ((call->own->has_magnitudes != 0u) && (magnitude != w->magnitude[other])) {
+  if (magnitude != w->magnitude[other]) {
     return magnitude < w->magnitude[other];
   }
   if (square != w->square[other]) {
@@ -81,7 +81,6 @@ static void insert_centroid(const starcat_call *call, uint32_t row, real magnitu
 static void take_usable(const starcat_call *call, const starcat_frame *frame,
                         starcat_result *result) {
   const starcat_camera *camera = &call->camera.given;
-  call->own->has_magnitudes = 0;
   for (uint32_t i = 0; i < frame->count; i++) {
     const real *x = frame->x_px + i, *y = frame->y_px + i;
     result->star[i] = STARCAT_NO_STAR;
@@ -90,10 +89,8 @@ static void take_usable(const starcat_call *call, const starcat_frame *frame,
     } else if ((*x < R(0.0)) || (*x >= camera->width_px) || (*y < R(0.0)) ||
                (*y >= camera->height_px)) {
       result->star[i] = STARCAT_DROPPED_OUT_OF_FRAME;
-    } else if ((frame->magnitudes != NULL) && starcat_is_finite(frame->magnitudes + i)) {
-      call->own->has_magnitudes = 1;
     } else {
-      /* a centroid whose magnitude is unknown */
+      /* usable */
     }
   }
 }
@@ -198,6 +195,7 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   call->near = NULL;
   call->near_square = R(0.0);
   call->log_attitudes = STARCAT_LOG_ALL_ATTITUDES;
+  call->own->has_magnitudes = 0;
   take_usable(call, frame, result);
   for (uint32_t i = 0; i < frame->count; i++) {
     if ((frame->sigma_px != NULL) && starcat_is_finite(frame->sigma_px + i) &&
@@ -205,9 +203,12 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
       return STARCAT_E_OPTIONS;
     }
     if (result->star[i] == STARCAT_NO_STAR) {
-      const int is_known =
-          (call->own->has_magnitudes != 0u) && starcat_is_finite(frame->magnitudes + i);
-      insert_centroid(call, i, is_known ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE,
+      /* A composite has numbers for unknown magnitudes, too. */
+      const int is_known = (frame->magnitudes != NULL) &&
+                           starcat_is_finite(frame->magnitudes + i) &&
+                           (frame->magnitudes[i] < STARCAT_UNKNOWN_MAGNITUDE);
+      call->own->has_magnitudes |= is_known != 0 ? 1u : 0u;
+      insert_centroid(call, i, is_known != 0 ? frame->magnitudes[i] : STARCAT_UNKNOWN_MAGNITUDE,
                       frame->x_px[i], frame->y_px[i]);
     }
   }

@@ -175,6 +175,7 @@ static starcat_status track_from(starcat_session *s, const starcat_frame *frame,
       starcat_track_frame(&s->image, choose_camera(s), &options, &moved, q, error_rad,
                           &s->workspace, &answer->result);
   answer->steps += answer->result.steps;
+  s->counts.tracks_refused += status == STARCAT_E_CAPACITY ? 1u : 0u;
   return status;
 }
 
@@ -186,7 +187,6 @@ static starcat_status track_frame(starcat_session *s, const starcat_frame *frame
   const starcat_status status = track_from(s, frame, s->q_prior, s->settings->prior_error_rad,
                                            s->settings->max_steps_track, answer);
   counts->tracks_failed += status == STARCAT_IDENTIFIED ? 0u : 1u;
-  counts->tracks_refused += status == STARCAT_E_CAPACITY ? 1u : 0u;
   if (answer->steps > counts->most_steps_track) {
     counts->most_steps_track = answer->steps;
   }

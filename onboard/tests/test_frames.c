@@ -203,6 +203,12 @@ void test_dropped(void) {
   CHECK_IS(unit_result.star[n + 2u], STARCAT_DROPPED_OUT_OF_FRAME);
   CHECK_IS(unit_result.star[n + 3u], STARCAT_DROPPED_OUT_OF_FRAME);
   CHECK_IS(unit_result.star[n + 4u], STARCAT_NO_STAR);
+  const starcat_result unknown = unit_result;
+  for (uint32_t i = 0; i < dirty.count; i++) {
+    magnitudes[i] = (starcat_real)3e38; /* as a composite has them */
+  }
+  CHECK_IS(identify(&unit_triangle, &dirty), STARCAT_IDENTIFIED);
+  CHECK(memcmp(&unit_result, &unknown, sizeof unknown) == 0);
 }
 
 /* Count the centroids that have the wrong star, and check the attitude. */

@@ -556,6 +556,9 @@ static void check_joined_frames(void) {
   for (uint32_t k = 0; k < 3u; k++) { /* two spots where the frame has one */
     composite.body[1][k] = composite.body[0][k];
   }
+  starcat_composite three = composite;
+  three.n_spots = 3; /* which are two of the frame */
+  CHECK(!join_again(0.0, 0.01, &three));
   CHECK(join_again(0.0, 0.01, &composite));
   CHECK_IS(composite.n_spots, truth.count);
   for (uint32_t i = 0; i < composite.n_spots; i++) {

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
 from starcat.geometry.attitude import solve_wahba_svd
 from starcat.geometry.camera import Camera
+from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.observation import Observation
 from starcat.matcher.prior import turn_of_noise_rad
 
@@ -42,7 +43,8 @@ MOST_SEEN = 1000
 class Composite:
     """Spots of successive frames, in the camera frame of the last one.
 
-    Those of the last frame are first, in its order, which may be that of their brightness.
+    Those of the last frame are first: the brightest, or without magnitudes the nearest to the
+    centre, so that the first ones of two frames are the same stars.
     """
 
     body: Directions
@@ -77,11 +79,11 @@ def joined(before: Composite, frame: Observation, turn_rad: float) -> Composite 
     if turn is None:
         return None
     spots, again = _shared(old, new.body @ turn.T, frame)
-    if len(spots) < LEAST_SHARED:
+    if len(np.unique(again)) < LEAST_SHARED:
         return None
     turn = solve_wahba_svd(old[spots], new.body[again])
     spots, again = _shared(old, new.body @ turn.T, frame)
-    if len(spots) < LEAST_SHARED:
+    if len(np.unique(again)) < LEAST_SHARED:
         return None
     return _merged(before, new, turn, spots, again, frame.camera.radius_rad)
 
@@ -124,7 +126,7 @@ def _merged(
     """Return the new spots in their order, and then the old ones that are kept.
 
     An old spot that is not seen again is dropped if it was seen once, before the last frame, or is
-    out of the field.
+    out of the field, or beyond the number of centroids that are searched.
     """
     again, first = np.unique(again, return_index=True)
     seen, body = new.seen.copy(), new.body.copy()
@@ -135,6 +137,7 @@ def _merged(
     old = before.body @ turn
     is_kept = (before.seen > 0) & (old[:, 2] >= math.cos(radius_rad))
     is_kept[spots] = False
+    is_kept[np.flatnonzero(is_kept)[max(0, MAX_CENTROIDS - len(new)) :]] = False
     return Composite(
         np.concatenate([body, old[is_kept]]),
         np.concatenate([new.mag, before.mag[is_kept]]),
@@ -144,4 +147,4 @@ def _merged(
 
 def _squared_chords(a: Array, b: Array) -> Array:
     """Return the squared distances of directions: shape (..., N, M) of (..., N, 3) and (M, 3)."""
-    return np.asarray(np.maximum(2.0 - 2.0 * (a @ b.T), 0.0))
+    return np.asarray(sum((a[..., :, None, axis] - b[:, axis]) ** 2 for axis in range(3)))

@@ -14,15 +14,16 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
+from numbers import Real
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from starcat.arguments import check_type, without_unit
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
+from starcat.matcher.brightest import MAX_CENTROIDS, brightest_of
 from starcat.matcher.composite import Composite, composite_of, joined
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import FrameLike, observe
@@ -40,7 +41,7 @@ MARGIN = 2.0
 """Error that is allowed for a prediction, over the error of the last predictions."""
 
 FADING = 0.5
-"""Weight of the error of an earlier prediction, for every frame since."""
+"""Weight of the error of an earlier prediction, for every step since."""
 
 MAX_STEPS = 5.0
 """Longest time of a prediction after the last answer, over the time between the last two."""
@@ -51,13 +52,17 @@ MAX_GAP = 2
 
 @dataclass(frozen=True)
 class _Motion:
-    """The motion that the last answers predict."""
+    """The motion that the last answers predict; after a single answer nothing of it is known."""
 
     q_body_from_icrs: Quaternion
     time: float
-    step: float = 1.0
-    turn: Turn = (0.0, 0.0, 0.0)
-    change_rad: float = math.inf
+    step: float = math.inf  # time between the last two answers
+    turn: Turn = (0.0, 0.0, 0.0)  # in a step
+    change_rad: float = math.inf  # of the turn, from one step to the next
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 @dataclass
@@ -81,20 +86,20 @@ class Tracker:
 
     matcher: Matcher
     max_turn_deg: float = 5.0
-    _motion: _Motion | None = field(default=None, init=False, repr=False)
-    _time: float = field(default=-math.inf, init=False, repr=False)
-    # The composite before the next frame, and the one that the last attempt has made with it.
-    _composite: Composite | None = field(default=None, init=False, repr=False)
-    _attempted: Composite | None = field(default=None, init=False, repr=False)
-    _gap: int = field(default=0, init=False, repr=False)  # frames since the last of the composite
+    _motion: _Motion | None = field(default=None, init=False, repr=False, compare=False)
+    _time: float = field(default=-math.inf, init=False, repr=False, compare=False)
+    # The composite before the next frame, and the one that its first attempt has made with it.
+    _composite: Composite | None = field(default=None, init=False, repr=False, compare=False)
+    _attempted: Composite | None = field(default=None, init=False, repr=False, compare=False)
+    # Whether the last attempt with an answer had it together with the frames before.
+    _is_confirmed: bool = field(default=False, init=False, repr=False, compare=False)
+    # Frames since the last one of the composite.
+    _gap: int = field(default=0, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         check_type("matcher", self.matcher, Matcher, "a starcat.Matcher")
         turn_deg = self.max_turn_deg = without_unit("max_turn_deg", self.max_turn_deg)
-        if (
-            not isinstance(turn_deg, int | float | np.floating)
-            or not 0.0 < turn_deg <= MAX_TURN_DEG
-        ):
+        if not _is_number(turn_deg) or not 0.0 < turn_deg <= MAX_TURN_DEG:
             raise ConfigError(
                 f"expected above 0, at most {MAX_TURN_DEG:g}",
                 parameter="max_turn_deg",
@@ -105,6 +110,7 @@ class Tracker:
         """Forget all frames: the next one is searched for in the whole sky."""
         self._motion, self._time = None, -math.inf
         self._composite = self._attempted = None
+        self._is_confirmed = False
 
     def identify(
         self,
@@ -165,7 +171,8 @@ class Tracker:
         """Identify the stars of the next frame as `identify` does, without recording the answer.
 
         A frame can be attempted several times, with other centroids or another ``fov_error``.
-        `record` then ends the frame.
+        `record` then ends the frame. The centroids of the first attempt are those that are put
+        together with the frames before.
         """
         now = self._next_time(time_s)
         camera = camera or self.matcher.database.camera
@@ -176,16 +183,18 @@ class Tracker:
         identify = partial(
             self.matcher.identify, centroids_px, camera, fov_error=fov_error, **beside
         )
-        answer, self._attempted = None, None
+        answer = None
         if expected is not None or error_deg is not None:
             answer = identify(prior=expected, prior_error_deg=error_deg)
         if answer is None or answer.status == "no_match":
             answer = identify()
-        if answer.status == "no_match" and not fov_error:
-            answer = self._confirmed(answer)
+        if answer.ok:
+            self._is_confirmed = False
+        elif answer.status == "no_match" and self._attempted is None:
+            answer = self._confirmed(answer, fov_error)
         return answer
 
-    def _confirmed(self, refused: MatchResult) -> MatchResult:
+    def _confirmed(self, refused: MatchResult, fov_error: float | None) -> MatchResult:
         """Return the answer to a refused frame that the frames before it confirm, if they do.
 
         The composite of the frames has to have an attitude, and the frame itself one near it: the
@@ -197,7 +206,8 @@ class Tracker:
         frame, matcher = refused.frame, self.matcher
         if frame is None:
             return refused
-        seen = observe(frame, matcher.settings)
+        first = frame if len(frame) <= MAX_CENTROIDS else brightest_of(frame).frame
+        seen = observe(first, matcher.settings)
         turn_deg = min(self.max_turn_deg, 0.5 * MAX_TURN_DEG)
         before, self._attempted = self._composite, composite_of(seen)
         longer = None if before is None else joined(before, seen, math.radians(turn_deg))
@@ -205,16 +215,18 @@ class Tracker:
             return refused
         self._attempted = longer
         centroids_px, mag = longer.pixels(frame.camera)
-        whole = matcher.identify(centroids_px, frame.camera, mag=mag)
+        whole = matcher.identify(centroids_px, frame.camera, mag=mag, fov_error=fov_error)
         if not whole.ok:
             return refused
         answer = matcher.identify(
             frame.centroids_px, frame.camera, mag=frame.mag, sigma_px=frame.sigma_px,
-            prior=whole.q_body_from_icrs, prior_error_deg=2.0 * turn_deg,
+            fov_error=fov_error, prior=whole.q_body_from_icrs, prior_error_deg=2.0 * turn_deg,
         )  # fmt: skip
         if not answer.ok:
             return refused
+        self._is_confirmed = True
         chance = max(whole.false_match_probability, answer.false_match_probability)
+        answer = answer.with_facts(frame_remarks=refused.frame_remarks)
         return replace(answer, false_match_probability=chance)
 
     def record(
@@ -234,7 +246,7 @@ class Tracker:
             return
         self._composite = None
         x, y, z, w = found.q_body_from_icrs.tolist()
-        is_new = found.origin == "lost_in_space" or made is not None
+        is_new = found.origin == "lost_in_space" or self._is_confirmed
         # An attitude beyond the prediction means a new motion: the next attitude is expected to
         # be the same as this one, within the largest turn.
         self._motion = (
@@ -265,7 +277,7 @@ class Tracker:
         if time_s is None:
             return 0.0 if math.isinf(self._time) else self._time + 1.0
         now = without_unit("time_s", time_s)
-        if not isinstance(now, int | float | np.floating) or not self._time < now < math.inf:
+        if not _is_number(now) or not self._time < now < math.inf:
             raise ConfigError(
                 f"expected a number above {self._time}, the time of the frame before",
                 parameter="time_s",
@@ -284,12 +296,16 @@ class Tracker:
     def _predicted_by(
         self, motion: _Motion, now: float, camera: Camera
     ) -> tuple[Quaternion, float] | tuple[None, None]:
+        if math.isinf(motion.change_rad):
+            return motion.q_body_from_icrs, self.max_turn_deg
         steps = (now - motion.time) / motion.step
         if steps > MAX_STEPS:
             return None, None
         floor_rad = FLOOR * self.matcher.settings.tolerance_px / camera.focal_length_px
-        # The error from a velocity that is not constant grows with the square of the time.
-        error_deg = math.degrees(floor_rad + MARGIN * motion.change_rad * steps * steps)
+        # The turn of the last step is that of its middle. With a constant acceleration it changes
+        # by `change_rad` from step to step, and the turns of the next steps by 1, 2, 3 ... of it.
+        change_rad = motion.change_rad * 0.5 * steps * (steps + 1.0)
+        error_deg = math.degrees(floor_rad + MARGIN * change_rad)
         x, y, z = motion.turn
         expected = after_turn(motion.q_body_from_icrs, (x * steps, y * steps, z * steps))
         return expected, min(self.max_turn_deg, error_deg)
@@ -303,5 +319,8 @@ class Tracker:
         about_axis = max(abs(z) * math.tan(camera.radius_rad), abs(z) - noise_rad)
         change_rad = math.hypot(x, y) + about_axis
         if math.isfinite(before.change_rad):
-            change_rad = max(change_rad, FADING * before.change_rad)
+            # Of two steps as long as this one.
+            change_rad *= 2.0 * step / (step + before.step)
+            longer = step / before.step
+            change_rad = max(change_rad, FADING**longer * longer**2 * before.change_rad)
         return _Motion(q, now, step, turn_between(before.q_body_from_icrs, q), change_rad)

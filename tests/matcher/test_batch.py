@@ -21,8 +21,9 @@ from starcat.frames.images.batch import (
     small_picture,
 )
 from starcat.frames.images.contact_sheet import write_contact_sheet
+from starcat.frames.images.image_file import write_image
 from starcat.frames.images.measure import LocalInputs
-from starcat.frames.images.render import write_simulated
+from starcat.frames.images.render import Optics, render_image, write_simulated
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion
 from starcat.matcher.database import open_database
 from starcat.matcher.matcher import Matcher
@@ -142,17 +143,25 @@ def test_a_small_picture_keeps_every_star(shape):
     assert small.max() == 255
 
 
-def test_a_picture_without_stars_is_one_frame_of_a_sequence(small_database, tmp_path, monkeypatch):
-    """A frame that is searched for again, in other ways, moves the time of the tracker once."""
-    database, generator = open_database(small_database), np.random.default_rng(3)
+def pictures_of_a_turn(database, folder, count):
+    """Write pictures of a camera that turns by 1.5 deg from each to the next."""
+    generator = np.random.default_rng(3)
     sky = Sky(database.directions, database.mag, np.arange(len(database.mag), dtype=np.int32))
-    q, paths, predictions = (0.0, 0.0, 0.0, 1.0), [], []
-    for number in range(6):
+    q, paths = (0.0, 0.0, 0.0, 1.0), []
+    for number in range(count):
         q = after_turn(q, (np.radians(1.5), 0.0, 0.0))
         matrix = matrix_from_quaternion(np.array(q))
         frame = simulate_frame(sky, database.camera, matrix, Noise(0.2), generator)
-        paths.append(tmp_path / f"{number}.png")
+        paths.append(folder / f"{number}.png")
         write_simulated(paths[-1], frame, database.camera, number)
+    return paths
+
+
+def test_a_picture_without_stars_is_one_frame_of_a_sequence(small_database, tmp_path, monkeypatch):
+    """A frame that is searched for again, in other ways, moves the time of the tracker once."""
+    predictions = []
+    paths = pictures_of_a_turn(open_database(small_database), tmp_path, 6)
+    generator = np.random.default_rng(4)
     dark = generator.normal(100.0, 5.0, (512, 512))
     Image.fromarray(np.rint(dark).astype(np.uint16)).save(paths[3])
     predicted = Tracker._predicted
@@ -169,6 +178,38 @@ def test_a_picture_without_stars_is_one_frame_of_a_sequence(small_database, tmp_
     assert origins == ["lost_in_space", *["tracking"] * 4]
     assert {now for now, _ in predictions} == set(map(float, range(6)))
     assert dict(predictions)[5.0] < 1.0  # degrees
+
+
+def test_a_picture_that_cannot_be_used_is_one_frame_of_a_sequence(small_database, tmp_path):
+    paths = pictures_of_a_turn(open_database(small_database), tmp_path, 11)
+    Image.fromarray(np.zeros((300, 512), dtype=np.uint16)).save(paths[8])
+    paths[9].write_bytes(b"no picture")
+    matcher = Matcher.open(small_database)
+    items = list(identify_files(paths, matcher, local=LocalInputs(track=True), workers=0))
+    assert [item.error is not None for item in items] == [False] * 8 + [True] * 2 + [False]
+    assert items[10].answers[0].result.origin == "tracking"
+
+
+def test_the_spots_of_pictures_are_put_together(small_database, tmp_path, monkeypatch):
+    """Those of the first measurement, whatever further attempts find."""
+    generator, seen = np.random.default_rng(6), []
+    place_px = generator.uniform(30.0, 480.0, (12, 2))
+    mag = generator.uniform(3.0, 5.0, 12)
+    for number in range(3):
+        light = render_image(place_px, mag, (512, 512), Optics(), number)
+        write_image(tmp_path / f"{number}.fits", light)
+    record = Tracker.record
+
+    def noted(self, *found, **beside):
+        record(self, *found, **beside)
+        seen.append(self._composite.seen.tolist())
+
+    monkeypatch.setattr(Tracker, "record", noted)
+    paths = sorted(tmp_path.glob("*.fits"))
+    matcher = Matcher.open(small_database)
+    items = list(identify_files(paths, matcher, local=LocalInputs(track=True), workers=0))
+    assert [item.answers[0].result.status for item in items] == ["no_match"] * 3
+    assert seen == [[1] * 12, [2] * 12, [3] * 12]
 
 
 def test_a_folder_is_read_by_calibrate_and_read_frames(small_database, tmp_path, monkeypatch):

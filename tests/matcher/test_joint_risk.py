@@ -9,6 +9,7 @@ from frames import few_in_numpy, frames_of
 from slew import steady_turn, wrong_by
 
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion, random_attitudes
+from starcat.geometry.camera import Camera
 from starcat.matcher.chance import LOG_ALL_ATTITUDES, log_attitudes_within
 from starcat.matcher.composite import composite_of, joined
 from starcat.matcher.matcher import Matcher
@@ -118,8 +119,8 @@ def test_spots_that_leave_the_field_are_dropped(sky):
         truth = np.concatenate([truth @ turn.T, _directions(sky, 1, generator)])
 
 
-def test_a_turn_through_many_stars_is_followed_by_the_brightest_of_each_frame(sky):
-    # The stars have no magnitudes, and the brightest are first.
+def test_a_turn_through_many_stars_is_followed(sky):
+    # The turn is sought with 24 stars of each frame.
     generator = np.random.default_rng(11)
     stars = generator.normal(size=(9000, 3))
     stars /= np.linalg.norm(stars, axis=1)[:, None]
@@ -138,6 +139,55 @@ def test_a_turn_through_many_stars_is_followed_by_the_brightest_of_each_frame(sk
             assert (composite.seen[: len(frame)] >= 1).all()
             assert (composite.seen >= 2).sum() >= 0.7 * len(frame)
         stars = stars @ turn.T
+
+
+def test_two_spots_are_not_enough_whatever_the_composite_has_beside_them(sky):
+    def spots(*px):
+        return observe(as_frame(np.array(px), sky.camera), Settings(noise_px=1.0))
+
+    three = composite_of(spots((200.0, 200.0), (201.0, 200.0), (800.0, 800.0)))
+    others = (500.0, 100.0), (100.0, 600.0)
+    assert joined(three, spots((210.0, 205.0), (810.0, 805.0), *others), 0.02) is None
+    assert joined(three, spots((200.0, 200.0), (205.0, 200.0), (800.0, 800.0)), 0.02) is None
+
+
+def test_a_composite_has_no_more_spots_than_are_searched(sky):
+    generator, tracker = np.random.default_rng(8), Tracker(Matcher(sky))
+    for _ in range(3):
+        px = generator.uniform(0.0, 1024.0, (4000, 2))
+        assert tracker.identify(px).status == "no_match"
+        assert len(tracker._composite) <= 512
+    few = composite_of(_observed(sky, _directions(sky, 300, generator)))
+    again = np.concatenate([few.body[:40], _directions(sky, 400, generator)])
+    both = joined(few, _observed(sky, again), 0.01)
+    assert len(both) == 512
+    assert (both.seen[:440] >= 1).all()
+
+
+def test_a_narrow_field_of_small_noise_is_joined():
+    camera = Camera(4096, 4096, fov_x_deg=0.1)
+    generator, settings = np.random.default_rng(9), Settings(noise_px=0.005)
+    for _ in range(20):
+        px = generator.uniform(200.0, 3900.0, (12, 2))
+        frames = [px + generator.normal(0.0, 0.005, px.shape) for _ in range(2)]
+        first, second = (observe(as_frame(each, camera), settings) for each in frames)
+        assert joined(composite_of(first), second, 1e-4) is not None
+
+
+def test_a_confirmed_answer_has_the_remarks_on_its_frame(sky):
+    matcher, generator = Matcher(sky, **STATED), np.random.default_rng(5)
+    remarks = []
+    for _ in range(40):
+        tracker = Tracker(matcher, max_turn_deg=1.0)
+        for frame in steady_turn(sky, WEAK, generator):
+            x, y = frame.centroids_px.T
+            table = {"x_px": x, "y_px": y, "mag": frame.mag, "colour": x}
+            found = tracker.identify(table)
+            if found.ok:
+                remarks += [found.remarks] if found.origin == "tracking" else []
+                break
+    assert remarks
+    assert all("not used: colour" in each[0] for each in remarks)
 
 
 def test_frames_that_share_no_spots_are_not_joined(sky):

@@ -214,6 +214,61 @@ def test_times_that_are_not_equally_apart(sky, engine):
     assert [answer.origin for answer in found[1:]] == ["tracking"] * (len(times) - 1)
 
 
+def turning(sky, angles_deg, noise=HARD):
+    """Yield frames of a camera that has turned by these angles about its x axis."""
+    stars = Sky(sky.directions, sky.mag, np.arange(len(sky.mag), dtype=np.int32))
+    generator = np.random.default_rng(12)
+    for angle_deg in angles_deg:
+        q = after_turn((0.0, 0.0, 0.0, 1.0), (math.radians(angle_deg), 0.0, 0.0))
+        matrix = matrix_from_quaternion(np.array(q))
+        yield simulate_frame(stars, sky.camera, matrix, noise, generator)
+
+
+@pytest.mark.parametrize("step_s", [0.05, 5.0, 60.0])
+def test_the_unit_of_time_does_not_matter(sky, step_s):
+    tracker = Tracker(Matcher(sky))
+    found = [
+        tracker.identify(frame.centroids_px, time_s=step_s * number)
+        for number, frame in enumerate(turning(sky, 0.05 * np.arange(6)))
+    ]
+    assert [answer.origin for answer in found] == ["lost_in_space", *["tracking"] * 5]
+
+
+@pytest.mark.parametrize("acceleration_deg", [0.05, 0.2])
+@pytest.mark.parametrize(
+    "times", [[*range(6), *range(10, 15)], [0, 1, 2, 3, 4, 5, 9, 9.5, 10, 10.5]], ids=str
+)
+def test_a_turn_that_speeds_up_is_tracked_after_missing_frames(sky, acceleration_deg, times):
+    times = np.array(times, dtype=float)
+    tracker = Tracker(Matcher(sky))
+    angles_deg = 0.3 * times + 0.5 * acceleration_deg * times**2
+    for time_s, frame in zip(times, turning(sky, angles_deg), strict=True):
+        found = tracker.identify(frame.centroids_px, time_s=time_s)
+        assert found.origin == ("tracking" if time_s else "lost_in_space"), time_s
+
+
+def test_the_first_of_two_attempts_can_be_recorded(sky):
+    trackers = [Tracker(Matcher(sky)) for _ in range(2)]
+    for number, frame in enumerate(turning(sky, range(6))):
+        for tracker in trackers:
+            found = tracker.attempt(frame.centroids_px)
+            if tracker is trackers[1] and number == 4:
+                assert tracker.attempt(frame.centroids_px[::-1] * 0.9).status == "no_match"
+            tracker.record(found)
+    assert trackers[0]._motion == trackers[1]._motion
+    assert trackers[0]._motion.change_rad < 0.01
+
+
+def test_numbers_of_numpy_are_numbers_and_trackers_can_be_compared(sky):
+    matcher = Matcher(sky)
+    tracker, other = Tracker(matcher, np.int64(3)), Tracker(matcher, 3.0)
+    for number, frame in enumerate(turning(sky, range(2))):
+        tracker.identify(frame.centroids_px, time_s=np.int64(number))
+    assert tracker == other
+    with pytest.raises(ConfigError, match="max_turn_deg is True"):
+        Tracker(matcher, max_turn_deg=True)
+
+
 def test_turns_and_times_that_cannot_be_are_refused(sky):
     for max_turn_deg in (0.0, -1.0, 21.0, math.nan, "5", None):
         with pytest.raises(ValueError, match=r"max_turn_deg is .*; expected above 0, at most 20"):

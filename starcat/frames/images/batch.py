@@ -192,17 +192,19 @@ def identify_files(
                 tracker.record(None)
             yield BatchItem(path, error=measured)
             continue
+        file, frame_answers = measured.file, list[FrameAnswer]()
         try:
-            file = measured.file
             camera, of_file = stated_camera(file.shape, matcher.database, options, local)
             answers = FileAnswers(path, matcher, file, camera, of_file, local, tracker)
-            frame_answers = tuple(answers)
+            frame_answers.extend(answers)
         except ConfigError as error:
+            if tracker is not None:
+                for _ in file.frames[len(frame_answers) :]:
+                    tracker.record(None)
             yield BatchItem(path, error=error, small=measured.small)
             continue
-        first = next(iter(frame_answers), None)
-        notes = answers.notes(first)
-        yield BatchItem(path, frame_answers, notes=tuple(notes), small=measured.small)
+        notes = answers.notes(frame_answers[0] if frame_answers else None)
+        yield BatchItem(path, tuple(frame_answers), notes=tuple(notes), small=measured.small)
 
 
 def _measured_files(
