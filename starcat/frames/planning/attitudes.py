@@ -223,17 +223,19 @@ def _times(name: str, values: Any) -> tuple[datetime, ...]:
 
 
 def _moment(value: Any) -> Any:
-    """Return a time as `Observer.at` takes it: of numpy, pandas and astropy, or a day of a year."""
+    """Return a time as `Observer.at` takes it: of numpy and Arrow, or with the day of a year."""
     if isinstance(value, np.datetime64):
         value = str(value.astype("datetime64[us]"))
-    text = str(getattr(value, "isot", value)).strip()
+    if isinstance(value, datetime) or hasattr(value, "isot"):
+        return value
+    text = str(value).strip()
     if len(text) > 8 and text[4:5] == "-" and text[8:9] == "T":  # 2027-032T10:00:00
         try:
             day = datetime.strptime(text[:8], "%Y-%j").date()
         except ValueError:
             return text
         text = f"{day}{text[8:]}"
-    return value if isinstance(value, datetime) else text
+    return text
 
 
 def _blocks(name: str, lines: list[str]) -> Iterator[tuple[dict[str, str], list[list[str]]]]:
