@@ -89,6 +89,47 @@ def numbers_of(name: str, values: Any, shape: str | tuple[int, ...]) -> Array:
     return numbers
 
 
+def rows_of(name: str, values: Any, width: int, count: str = "N") -> Array:
+    """Return an argument as rows of ``width`` real numbers, converted as by `numbers_of`.
+
+    Parameters
+    ----------
+    name : str
+        Name of the parameter. Its suffix states the unit.
+    values : array_like
+        Real numbers of shape (N, width). An empty list is no rows.
+    width : int
+        Numbers in a row.
+    count : str, default "N"
+        Name of the number of rows in the error message.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, width)
+
+    Raises
+    ------
+    ConfigError
+        If the values are not real numbers, have another shape, or their unit cannot be converted.
+    """
+    expected = f"({count}, {width})"
+    numbers: Array
+    if type(values) is np.ndarray and values.dtype is FLOAT64 and values.shape[1:] == (width,):
+        numbers = values  # fast path: nearly all calls
+        return numbers
+    expected = f"({count}, {width})"
+    numbers = numbers_of(name, values, expected)
+    if numbers.shape == (0,):
+        return numbers.reshape(0, width)
+    if numbers.shape[1:] != (width,):
+        raise ConfigError(
+            f"its shape is {numbers.shape}; expected {expected}",
+            parameter=name,
+            hint="a single row is a list of one row" if numbers.shape == (width,) else (),
+        )
+    return numbers
+
+
 _TYPES = {"U": "text", "S": "text", "b": "bool", "c": "complex"}
 
 
