@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from starcat.arguments import path_of, rows_of, without_unit, without_unit_of_count
 from starcat.arrays import Array, Mask, Pixels
 from starcat.errors import ConfigError
-from starcat.geometry.distortion import NO_DISTORTION, Distortion, checked_number, distortion_of
+from starcat.geometry.distortion import Distortion, checked_number, distortion_of
 from starcat.geometry.sphere import separation
 from starcat.version import missing_packages
 
@@ -81,7 +81,7 @@ class Camera:
         fov_x_deg: float | None = None,
         fov_y_deg: float | None = None,
         principal_point_px: Iterable[float] | None = None,
-        distortion: Distortion | Mapping[str, float] | ArrayLike = NO_DISTORTION,
+        distortion: Distortion | Mapping[str, float] | ArrayLike | None = None,
         readout_s: float | None = None,
     ) -> None:
         w, h = _size("width_px", width_px), _size("height_px", height_px)

@@ -462,6 +462,7 @@ def test_cameras_and_distortions_are_values():
     again = Camera(1024, 768, 2000, principal_point_px=np.array([512, 384]))
     assert again == WIDE
     assert hash(again) == hash(WIDE)
+    assert Camera(1024, 768, 2000.0, principal_point_px=None, distortion=None) == WIDE
     assert len({WIDE, again, LENS}) == 2
     assert Camera(1024, 768, 2000.0, distortion=BARREL) != WIDE
     assert Camera(1024, 768, 2000.0, principal_point_px=(512.0, 384.5)) != WIDE
