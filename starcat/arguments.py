@@ -144,6 +144,8 @@ def _number(value: Any) -> float:
 def without_unit(name: str, values: Any) -> Any:
     """Return a number or numbers without their unit, converted to the unit of the parameter.
 
+    An array without dimensions becomes its number.
+
     Raises
     ------
     ConfigError
@@ -159,7 +161,7 @@ def without_unit(name: str, values: Any) -> Any:
     if unit is None:
         unit = getattr(values, "units", None)  # the name in other libraries of units
     if unit is None:
-        return values
+        return values[()] if type(values) is np.ndarray and values.ndim == 0 else values
     expected = unit_of_argument(name)
     try:
         quantity = getattr(values, "quantity", values)  # a column of an astropy table has it
