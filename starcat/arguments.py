@@ -89,6 +89,47 @@ def numbers_of(name: str, values: Any, shape: str | tuple[int, ...]) -> Array:
     return numbers
 
 
+def rows_of(name: str, values: Any, width: int, count: str = "N") -> Array:
+    """Return an argument as rows of ``width`` real numbers, converted as by `numbers_of`.
+
+    Parameters
+    ----------
+    name : str
+        Name of the parameter. Its suffix states the unit.
+    values : array_like
+        Real numbers of shape (N, width). An empty list is no rows.
+    width : int
+        Numbers in a row.
+    count : str, default "N"
+        Name of the number of rows in the error message.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, width)
+
+    Raises
+    ------
+    ConfigError
+        If the values are not real numbers, have another shape, or their unit cannot be converted.
+    """
+    expected = f"({count}, {width})"
+    numbers: Array
+    if type(values) is np.ndarray and values.dtype is FLOAT64 and values.shape[1:] == (width,):
+        numbers = values  # fast path: nearly all calls
+        return numbers
+    expected = f"({count}, {width})"
+    numbers = numbers_of(name, values, expected)
+    if numbers.shape == (0,):
+        return numbers.reshape(0, width)
+    if numbers.shape[1:] != (width,):
+        raise ConfigError(
+            f"its shape is {numbers.shape}; expected {expected}",
+            parameter=name,
+            hint="a single row is a list of one row" if numbers.shape == (width,) else (),
+        )
+    return numbers
+
+
 _TYPES = {"U": "text", "S": "text", "b": "bool", "c": "complex"}
 
 
@@ -102,6 +143,8 @@ def _number(value: Any) -> float:
 
 def without_unit(name: str, values: Any) -> Any:
     """Return a number or numbers without their unit, converted to the unit of the parameter.
+
+    An array without dimensions becomes its number.
 
     Raises
     ------
@@ -118,7 +161,7 @@ def without_unit(name: str, values: Any) -> Any:
     if unit is None:
         unit = getattr(values, "units", None)  # the name in other libraries of units
     if unit is None:
-        return values
+        return values[()] if type(values) is np.ndarray and values.ndim == 0 else values
     expected = unit_of_argument(name)
     try:
         quantity = getattr(values, "quantity", values)  # a column of an astropy table has it

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -137,6 +138,39 @@ def radec_roll_from_matrix(matrix: Matrix) -> tuple[float, float, float]:
     # A tiny negative angle modulo 360 rounds to 360 itself; the second modulo makes that 0.
     ra_deg, roll_deg = (math.degrees(angle) % 360.0 % 360.0 for angle in angles)
     return ra_deg, math.degrees(math.atan2(z, level)), roll_deg
+
+
+class HasAttitude:
+    """The base of what has an attitude ``matrix``: its quaternion and its angles."""
+
+    matrix: Matrix
+
+    @cached_property
+    def q_body_from_icrs(self) -> Array:
+        """Attitude [x, y, z, w], shape (4,); NaN if there is none.
+
+        ``Rotation.from_quat(q).inv()`` of scipy converts ICRS components into camera components.
+        """
+        return quaternion_from_matrix(self.matrix)
+
+    @cached_property
+    def _angles(self) -> tuple[float, float, float]:
+        return radec_roll_from_matrix(self.matrix)
+
+    @property
+    def boresight_ra_deg(self) -> float:
+        """Right ascension of the boresight; NaN if there is no attitude."""
+        return self._angles[0]
+
+    @property
+    def boresight_dec_deg(self) -> float:
+        """Declination of the boresight; NaN if there is no attitude."""
+        return self._angles[1]
+
+    @property
+    def roll_deg(self) -> float:
+        """Roll, as `matrix_from_radec_roll` has it; NaN if there is no attitude."""
+        return self._angles[2]
 
 
 def solve_wahba_svd(body: Directions, icrs: Directions, weights: Array | None = None) -> Array:

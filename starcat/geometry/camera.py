@@ -17,10 +17,10 @@ from numbers import Integral
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arguments import path_of, without_unit, without_unit_of_count
-from starcat.arrays import Array, Directions, Mask, Pixels
+from starcat.arguments import path_of, rows_of, without_unit, without_unit_of_count
+from starcat.arrays import Array, Mask, Pixels
 from starcat.errors import ConfigError
-from starcat.geometry.distortion import NO_DISTORTION, Distortion, checked_number, distortion_of
+from starcat.geometry.distortion import Distortion, checked_number, distortion_of
 from starcat.geometry.sphere import separation
 from starcat.version import missing_packages
 
@@ -81,7 +81,7 @@ class Camera:
         fov_x_deg: float | None = None,
         fov_y_deg: float | None = None,
         principal_point_px: Iterable[float] | None = None,
-        distortion: Distortion | Mapping[str, float] | ArrayLike = NO_DISTORTION,
+        distortion: Distortion | Mapping[str, float] | ArrayLike | None = None,
         readout_s: float | None = None,
     ) -> None:
         w, h = _size("width_px", width_px), _size("height_px", height_px)
@@ -241,7 +241,7 @@ class Camera:
         x, y, z = self.directions_from_pixels(self._corners).T
         return float(np.arctan2(np.hypot(x, y), z).max())
 
-    def pixels_from_directions(self, body: Directions) -> Array:
+    def pixels_from_directions(self, body: ArrayLike) -> Array:
         """Project directions in the camera frame, of any length, onto the detector.
 
         Parameters
@@ -254,7 +254,13 @@ class Camera:
         ndarray of float64, shape (N, 2)
             Pixels. NaN for a direction that lies behind the camera, or so far off the axis that
             the distortion folds its image back.
+
+        Raises
+        ------
+        ConfigError
+            If the argument has another shape, or a unit that cannot be converted.
         """
+        body = rows_of("body", body, 3)
         z = np.where(body[:, 2:] > 0.0, body[:, 2:], np.nan)
         if self.distortion.is_none:
             pixels = body[:, :2] * (self.focal_length_px / z)
@@ -264,20 +270,26 @@ class Camera:
         pixels += self._axis_px
         return np.asarray(pixels)
 
-    def directions_from_pixels(self, centroids_px: Pixels) -> Array:
+    def directions_from_pixels(self, centroids_px: ArrayLike) -> Array:
         """Return the directions of centroids.
 
         Parameters
         ----------
         centroids_px : array_like of float64, shape (N, 2)
-            Pixels.
+            Pixels; a quantity is converted.
 
         Returns
         -------
         ndarray of float64, shape (N, 3)
             Unit vectors in the camera frame; NaN if no direction inside the fold has that image,
             which happens only off the detector.
+
+        Raises
+        ------
+        ConfigError
+            If the argument has another shape, or a unit that cannot be converted.
         """
+        centroids_px = rows_of("centroids_px", centroids_px, 2)
         body = np.empty((len(centroids_px), 3))
         np.subtract(centroids_px, self._axis_px, out=body[:, :2])
         body[:, 2] = self.focal_length_px
@@ -288,7 +300,7 @@ class Camera:
         body /= np.sqrt(np.einsum("ij,ij->i", body, body))[:, None]
         return body
 
-    def contains(self, centroids_px: Pixels) -> Mask:
+    def contains(self, centroids_px: ArrayLike) -> Mask:
         """Return which pixels lie on the detector.
 
         Closed at the left and top edge, open at the right and bottom; NaN lies outside.
@@ -296,13 +308,19 @@ class Camera:
         Parameters
         ----------
         centroids_px : array_like of float64, shape (N, 2)
-            Pixels.
+            Pixels; a quantity is converted.
 
         Returns
         -------
         ndarray of bool, shape (N,)
             True on the detector.
+
+        Raises
+        ------
+        ConfigError
+            If the argument has another shape, or a unit that cannot be converted.
         """
+        centroids_px = rows_of("centroids_px", centroids_px, 2)
         inside = (centroids_px >= 0.0) & (centroids_px < 2.0 * self.middle_px)
         return np.asarray(inside[:, 0] & inside[:, 1])
 

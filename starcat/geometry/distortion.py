@@ -191,7 +191,9 @@ OPENCV = ("k1", "k2", "p1", "p2", "k3")
 
 
 def distortion_of(value: Any) -> Distortion:
-    """Return the distortion that an argument describes: itself, a mapping, or five numbers."""
+    """Return the distortion of an argument: itself, a mapping, five numbers, or None for none."""
+    if value is None:
+        return NO_DISTORTION
     if isinstance(value, Distortion):
         return value
     if isinstance(value, Mapping):

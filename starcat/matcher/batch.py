@@ -119,6 +119,10 @@ class BatchResult(Sequence[MatchResult]):
             [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)]
         )
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for another process: the answers, in place of how they are made."""
+        return {**vars(self), "_answer": list(self).__getitem__}
+
     def __repr__(self) -> str:
         return f"<BatchResult: {int(self.ok.sum()):,} of {count_of(len(self), 'frame')} identified>"
 

@@ -17,7 +17,7 @@ from starcat.arguments import wrong_type
 from starcat.arrays import Array, Directions, Matrix, Pixels
 from starcat.database.onboard.flight_limits import centroids_in_flight
 from starcat.errors import ConfigError, NotIdentifiedError, count_of
-from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
+from starcat.geometry.attitude import HasAttitude, quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.html_tables import html_table
 from starcat.matcher import sky_objects
@@ -66,7 +66,7 @@ number of its terms, and of the star numbers and star rows of the centroids that
 
 
 @dataclass(frozen=True, eq=False)
-class MatchResult:
+class MatchResult(HasAttitude):
     """The answer to one frame of centroids.
 
     Attributes
@@ -230,25 +230,6 @@ class MatchResult:
         if self._record is not None:
             return np.ndarray(4, np.float64, self._record, Q_AT)
         return quaternion_from_matrix(self.matrix)
-
-    @cached_property
-    def _angles(self) -> tuple[float, float, float]:
-        return radec_roll_from_matrix(self.matrix)
-
-    @property
-    def boresight_ra_deg(self) -> float:
-        """Right ascension of the boresight; NaN unless identified."""
-        return self._angles[0]
-
-    @property
-    def boresight_dec_deg(self) -> float:
-        """Declination of the boresight; NaN unless identified."""
-        return self._angles[1]
-
-    @property
-    def roll_deg(self) -> float:
-        """Roll, as `matrix_from_radec_roll` has it; NaN unless identified."""
-        return self._angles[2]
 
     @cached_property
     def stars(self) -> MatchedStars:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
     from starcat.pipeline.report.report import CoverageReport
     from starcat.pipeline.specs.build_spec import BuildSpec
     from starcat.query.result import QueryResult
-    from starcat.query.session import Limits
+    from starcat.query.session import Limits, Session
 
 
 class Database(reader.DatabaseFolder):
@@ -166,7 +166,7 @@ class Connection:
 
         self._targets = targets
         self._open = ExitStack()
-        self._session = self._open.enter_context(open_session(targets, limits))
+        self._session: Session | None = self._open.enter_context(open_session(targets, limits))
 
     def sql(self, text: str, **values: Any) -> QueryResult:
         """Run a query, like `Database.sql`.
@@ -186,12 +186,14 @@ class Connection:
         Raises
         ------
         QueryError
-            If the text is not a query, or the query is not allowed.
+            If the text is not a query, the query is not allowed, or the connection is closed.
         QueryLimitError
             If the query exceeds a limit.
         """
         from starcat.query.result import QueryResult
 
+        if self._session is None:
+            raise QueryError("the connection is closed", hint="open it again with starcat.connect")
         arguments = {name: _value_of_query(name, value) for name, value in values.items()}
         try:
             with self._session.ask(text, arguments) as answer:
@@ -202,6 +204,7 @@ class Connection:
 
     def close(self) -> None:
         """Close the tables, and remove the temporary files made for reading them."""
+        self._session = None
         self._open.close()
 
     def __enter__(self) -> Connection:

@@ -207,6 +207,34 @@ def test_tables_of_angles_and_of_quaternions_are_the_same_attitudes(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ((10, 20, 30), r"its shape is \(3,\); expected \(K, 4\)$"),
+        ([0, 0, 0, 1], r"its shape is \(4,\); expected \(K, 4\); a single row is a list of one"),
+        (np.ones((2, 3, 3)), r"its shape is \(2, 3, 3\); expected \(K, 4\)$"),
+        ([], "has 0 rows; expected 1 to"),
+        (
+            {"time": [TIME], "q_body_from_icrs": quaternions(2)},
+            "time has 1 row, q_body_from_icrs has 2 rows; expected columns of one length$",
+        ),
+        (
+            {"time": TIME, "ra_deg": [1, 2], "dec_deg": [3, 4], "roll_deg": [5]},
+            "time has 1 row, ra_deg has 2 rows, dec_deg has 2 rows, roll_deg has 1 row; expected",
+        ),
+    ],
+)
+def test_attitudes_of_another_shape_are_refused(given, words):
+    with pytest.raises(ConfigError, match=f"^attitudes: {words}"):
+        attitudes_of(given)
+
+
+def test_columns_of_an_orbit_are_equally_long():
+    columns = {name: [1.0, 2.0] for name in ("x_km", "y_km", "z_km", "vx_km_s", "vy_km_s")}
+    with pytest.raises(ConfigError, match=r"^orbit: time has 2 rows, .* vz_km_s has 1 row; expect"):
+        orbit_of({"time": [TIME, TIME], **columns, "vz_km_s": [1.0]})
+
+
 def test_every_star_is_taken_or_has_a_reason(small_database):
     plan = face.plan(small_database, quaternions(10), limit_mag=5.5)
     for row in range(10):

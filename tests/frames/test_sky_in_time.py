@@ -26,6 +26,7 @@ from starcat.errors import ConfigError
 from starcat.frames.images.measure import LocalInputs, MeasuredFile
 from starcat.frames.images.picture import draw
 from starcat.frames.images.solve_files import FileAnswers
+from starcat.frames.planning.attitudes import attitudes_of
 from starcat.frames.sky.bodies import PHASE_CURVES, apparent_magnitude, bodies_seen
 from starcat.frames.sky.in_time import (
     earth_limb_angle_deg,
@@ -139,6 +140,23 @@ def test_a_time_without_a_zone_is_utc_and_a_zone_is_heeded():
     for same in (*texts, moment, moment.replace(tzinfo=None), moment.astimezone(behind)):
         assert Observer.at(same).time == moment
     assert Observer.at(moment).in_words == "2026-11-22T10:00:00Z"
+
+
+@pytest.mark.parametrize("scale", ["utc", "tai", "tt", "tdb"])
+@pytest.mark.parametrize("form", ["isot", "jd", "mjd", "unix", "jyear"])
+def test_a_time_of_astropy_is_converted_from_its_scale(scale, form):
+    text = "2026-11-22T10:00:00.123456"
+    time = Time(getattr(Time(text, scale="utc"), scale), format=form)
+    expected = datetime.fromisoformat(text).replace(tzinfo=UTC)
+    assert abs(Observer.at(time).time - expected) <= timedelta(microseconds=1)
+    planned = attitudes_of({"time": Time([time, time]), "q_body_from_icrs": np.eye(4)[[3, 3]]})
+    assert planned.times == (Observer.at(time).time,) * 2
+
+
+def test_a_time_of_astropy_that_is_no_moment_is_refused():
+    for time in (Time("2026-11-22T10:00:00", scale="local"), Time([TIMES[2], TIMES[2]])):
+        with pytest.raises(ConfigError, match="expected date and time in UTC"):
+            Observer.at(time)
 
 
 NO_TIMES = ("yesterday", "2026-11-22", "2026-13-22T10:00", "", 20261122)

@@ -10,6 +10,7 @@ import pickle
 import re
 from itertools import combinations
 
+import astropy.units as u
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -53,6 +54,36 @@ def cameras(draw):
         assume(False)
     assume(math.tan(camera.radius_rad) < 0.9 * camera.distortion.fold_radius)
     return camera
+
+
+# Arguments --------------------------------------------------------------------------------------
+
+
+def test_points_are_lists_arrays_or_quantities():
+    px = [[100.0, 900.0], [500.0, 400.0]]
+    body = LENS.directions_from_pixels(np.array(px))
+    for points in (px, [[100, 900], [500, 400]], px * u.pix, np.array(px, dtype=np.float32)):
+        assert np.array_equal(LENS.directions_from_pixels(points), body)
+        assert LENS.contains(points).tolist() == [False, True]
+    for points in (body.tolist(), tuple(body), body * u.one):
+        np.testing.assert_allclose(LENS.pixels_from_directions(points), px)
+    assert LENS.directions_from_pixels([]).shape == (0, 3)
+    assert LENS.pixels_from_directions([]).shape == (0, 2)
+    assert LENS.contains([]).shape == (0,)
+
+
+@pytest.mark.parametrize("values", [[1.0, 2.0], [[1.0, 2.0, 3.0, 4.0]], np.ones((2, 1, 3)), 5.0])
+def test_points_of_another_shape_or_unit_are_refused(values):
+    shape = re.escape(str(np.shape(values)))
+    for ask in (LENS.directions_from_pixels, LENS.contains):
+        with pytest.raises(ConfigError, match=rf"^centroids_px: its shape is {shape}; .*\(N, 2\)"):
+            ask(values)
+        with pytest.raises(ConfigError, match="its unit is 'deg'; expected pix"):
+            ask([[1.0, 2.0]] * u.deg)
+    with pytest.raises(ConfigError, match=rf"^body: its shape is {shape}; expected \(N, 3\)"):
+        LENS.pixels_from_directions(np.array(values))
+    with pytest.raises(ConfigError, match="a single row is a list of one row"):
+        LENS.pixels_from_directions(np.array([0.0, 0.0, 1.0]))
 
 
 # Oracles: one point at a time, as the formula is printed in OpenCV's documentation -------------
@@ -431,6 +462,7 @@ def test_cameras_and_distortions_are_values():
     again = Camera(1024, 768, 2000, principal_point_px=np.array([512, 384]))
     assert again == WIDE
     assert hash(again) == hash(WIDE)
+    assert Camera(1024, 768, 2000.0, principal_point_px=None, distortion=None) == WIDE
     assert len({WIDE, again, LENS}) == 2
     assert Camera(1024, 768, 2000.0, distortion=BARREL) != WIDE
     assert Camera(1024, 768, 2000.0, principal_point_px=(512.0, 384.5)) != WIDE

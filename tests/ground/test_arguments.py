@@ -79,6 +79,19 @@ def test_a_single_number_has_its_unit_converted(matcher, frame):
     assert off.camera == matcher.identify(frame, fov_error=0.05).camera
 
 
+def test_an_array_without_dimensions_is_a_number(matcher):
+    number = np.array(0.5)
+    stated = starcat.Matcher(matcher.database, noise_px=number, max_steps=np.array(1000))
+    assert (stated.settings.noise_px, stated.settings.max_steps) == (0.5, 1000)
+    assert starcat.Camera(64, np.array(64), fov_x_deg=number) == starcat.Camera(
+        64, 64, None, fov_x_deg=0.5
+    )
+    assert starcat.simulate(matcher.database, np.array(1), noise_px=number, seed=7)
+    for wrong in (np.array(99.0), np.array([0.5]), np.array(True), np.array("0.5")):
+        with pytest.raises(ConfigError, match=r"noise_px is .*; expected 0\.001 to 50"):
+            starcat.Matcher(matcher.database, noise_px=wrong)
+
+
 def test_masked_entries_are_not_used(matcher, frame):
     px = np.ma.array(frame.centroids_px, mask=False)
     px[0] = np.ma.masked

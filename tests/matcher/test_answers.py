@@ -198,6 +198,23 @@ def test_an_answer_goes_to_another_process_without_its_database(sky):
     assert len(again.table()) == found.n_matched
 
 
+@both_engines
+def test_answers_to_many_frames_go_to_another_process(sky, engine):
+    frames = [a_frame(sky, sky.camera, seed=seed).centroids_px for seed in (5, 6)]
+    # The last one has more centroids than the C library takes.
+    crowd = np.random.default_rng(1).uniform(0.0, sky.camera.height_px, (600, 2))
+    found = Matcher(sky, engine=engine).identify_many([*frames, [[1.0, 2.0]], crowd])
+    data = pickle.dumps(found)
+    again = pickle.loads(data)
+    assert len(data) < 100_000
+    assert list(again) == list(found)
+    assert again.status == found.status
+    assert again.q_body_from_icrs.tobytes() == found.q_body_from_icrs.tobytes()
+    assert again.seconds.tolist() == found.seconds.tolist()
+    assert again[0].stars.ra_deg.tolist() == found[0].stars.ra_deg.tolist()
+    assert (len(again[1:3]), again[-1].status) == (2, found[-1].status)
+
+
 def deviations(
     sky: MatcherDatabase, camera: Camera, noise_px: float, *, is_stated: bool
 ) -> tuple[np.ndarray, int]:

@@ -189,6 +189,14 @@ def test_several_targets_are_joined(small_database):
     assert next(iter(found)) == (starcat.open(small_database).stars.num_rows,)
 
 
+def test_a_closed_connection_says_so(small_database):
+    connection = starcat.connect(small_database)
+    for _ in range(2):
+        connection.close()
+        with pytest.raises(QueryError, match=r"^the connection is closed; open it again with"):
+            connection.sql("SELECT 1")
+
+
 def test_a_catalog_and_a_spec_are_read_from_strings(tmp_path, sao_file, small_spec):
     (tmp_path / "small.toml").write_text(small_spec)
     read = starcat.ingest("sao", str(sao_file))

@@ -271,6 +271,16 @@ def test_a_batch_has_arrays_and_a_short_repr(matcher, frames):
     assert "and 20 more rows" in many._repr_html_()
 
 
+def test_a_frame_states_its_attitude_as_an_answer_does(matcher, frames):
+    frame, answer = frames[0], matcher.identify(frames[0])
+    assert abs(frame.q_body_from_icrs @ answer.q_body_from_icrs) == pytest.approx(1.0, abs=1e-6)
+    angles = frame.boresight_ra_deg, frame.boresight_dec_deg, frame.roll_deg
+    found = answer.boresight_ra_deg, answer.boresight_dec_deg, answer.roll_deg
+    assert angles == pytest.approx(found, abs=0.5)
+    text = "RA {:.4f}, Dec {:+.4f}, roll {:.4f} deg".format(*angles)
+    assert text in repr(frame)
+
+
 def test_a_frame_counts_its_guide_stars(frames):
     frame = replace(frames[0], star_index=np.array([0, 3, -1, 7, -1]))
     assert frame.n_stars == 3

@@ -130,6 +130,13 @@ def test_a_cone_holds_what_is_near(session, place, radius_deg):
     assert np.array_equal(found, np.sort(ids[apart <= radius_deg]))
 
 
+@pytest.mark.parametrize("cone", ["10, -95, 5", "10, 95, 5", "10, 5, -1", "10, 5, 'nan'::DOUBLE"])
+def test_a_cone_that_does_not_exist_is_an_error(session, cone):
+    with pytest.raises(QueryError, match="does not exist: give "):
+        column(session, f"SELECT count(*) FROM cone({cone})")
+    assert column(session, "SELECT count(*) FROM cone(10, 5, 0)").tolist() == [0]
+
+
 def test_a_cone_can_be_of_another_table(session):
     query = "SELECT count(*) FROM cone(0, 0, 180, of := '{}')"
     for view in ("rejected", "boresights"):

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from starcat.arguments import columns_of, numbers_of, path_of
+from starcat.arguments import columns_of, numbers_of, path_of, rows_of
 from starcat.arrays import Array
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, count_of
 from starcat.frames.sky.observer import Observer
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.storage.regular_files import read_regular_file
@@ -97,7 +97,7 @@ def attitudes_of(value: Any, alignment: Any = None) -> PlannedAttitudes:
     """
     name, columns = _columns("attitudes", value, _aem, ("q_body_from_icrs",))
     if "q_body_from_icrs" in columns:
-        q = numbers_of("attitudes", columns["q_body_from_icrs"], "(K, 4)")
+        q = rows_of("attitudes", columns["q_body_from_icrs"], 4, "K")
     elif set(QUATERNION) <= set(columns):
         q = np.column_stack([_numbers(name, columns, column) for column in QUATERNION])
     elif set(ANGLES) <= set(columns):
@@ -113,7 +113,7 @@ def attitudes_of(value: Any, alignment: Any = None) -> PlannedAttitudes:
             f"(q_body_from_icrs, scalar last) or {', '.join(ANGLES)}, and time",
             where=name,
         )
-    length = np.sqrt(np.sum(q * q, axis=1)) if q.ndim == 2 and q.shape[1] == 4 else np.zeros(1)
+    length = np.sqrt(np.sum(q * q, axis=1))
     bad = np.flatnonzero(~(np.abs(length - 1.0) < 0.01))
     if len(bad):
         raise ConfigError(
@@ -171,6 +171,7 @@ def _columns(
     """Return the name of a table in messages, and its columns."""
     columns = columns_of(value)
     if columns is not None:
+        _check_lengths(argument, columns)
         return argument, columns
     if default and not isinstance(value, str | Path) and not hasattr(value, "__fspath__"):
         return argument, {default[0]: value}
@@ -192,6 +193,22 @@ def _columns(
         if len(row) != len(names):
             raise ConfigError(f"row {number} has {len(row)} fields, not {len(names)}", where=path)
     return str(path), {name: [row[k] for row in rows[1:]] for k, name in enumerate(names)}
+
+
+def _check_lengths(argument: str, columns: Mapping[str, Any]) -> None:
+    """Check that the columns of a table that are used are equally long."""
+    used = ("time", "q_body_from_icrs", *QUATERNION, *ANGLES, *STATE)
+    counts = {column: _length(columns[column]) for column in used if column in columns}
+    if len(set(counts.values())) > 1:
+        found = ", ".join(f"{column} has {count_of(n, 'row')}" for column, n in counts.items())
+        raise ConfigError(f"{found}; expected columns of one length", parameter=argument)
+
+
+def _length(column: Any) -> int:
+    try:
+        return 1 if isinstance(column, str) else len(column)
+    except TypeError:  # a single value
+        return 1
 
 
 def _numbers(name: str, columns: Mapping[str, Any], column: str) -> Array:
@@ -223,17 +240,19 @@ def _times(name: str, values: Any) -> tuple[datetime, ...]:
 
 
 def _moment(value: Any) -> Any:
-    """Return a time as `Observer.at` takes it: of numpy, pandas and astropy, or a day of a year."""
+    """Return a time as `Observer.at` takes it: of numpy and Arrow, or with the day of a year."""
     if isinstance(value, np.datetime64):
         value = str(value.astype("datetime64[us]"))
-    text = str(getattr(value, "isot", value)).strip()
+    if isinstance(value, datetime) or hasattr(value, "isot"):
+        return value
+    text = str(value).strip()
     if len(text) > 8 and text[4:5] == "-" and text[8:9] == "T":  # 2027-032T10:00:00
         try:
             day = datetime.strptime(text[:8], "%Y-%j").date()
         except ValueError:
             return text
         text = f"{day}{text[8:]}"
-    return value if isinstance(value, datetime) else text
+    return text
 
 
 def _blocks(name: str, lines: list[str]) -> Iterator[tuple[dict[str, str], list[list[str]]]]:

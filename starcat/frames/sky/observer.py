@@ -16,7 +16,7 @@ import re
 import warnings
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import erfa
 import numpy as np
@@ -25,6 +25,9 @@ from numpy.typing import ArrayLike
 from starcat.arguments import numbers_of as numbers_of_array
 from starcat.arrays import Array
 from starcat.errors import AsWritten, ConfigError
+
+if TYPE_CHECKING:
+    from astropy.time import Time
 
 LIGHT_KM_S = 299_792.458  # speed of light in vacuum (exact)
 AU_KM = 149_597_870.7  # astronomical unit (IAU 2012 Resolution B2, exact)
@@ -113,7 +116,7 @@ class Observer:
     @classmethod
     def at(
         cls,
-        time: str | datetime,
+        time: str | datetime | Time,
         *,
         position_km: ArrayLike | None = None,
         velocity_km_s: ArrayLike | None = None,
@@ -123,8 +126,9 @@ class Observer:
 
         Parameters
         ----------
-        time : str or datetime
-            UTC, such as ``2026-11-22T10:00:00``; a time zone in it is used.
+        time : str, datetime or astropy.time.Time
+            UTC, such as ``2026-11-22T10:00:00``; a time zone in it is used. A Time of another
+            scale is converted.
         position_km, velocity_km_s : array_like of float64, shape (3,), optional
             Relative to the origin, km and km/s (quantities with another unit of length and
             velocity are converted), in ICRS axes (for the Earth GCRS, or J2000, but not the axes
@@ -219,10 +223,12 @@ def _three(name: str, values: ArrayLike) -> Array:
     return numbers
 
 
-def _utc(time: str | datetime) -> datetime:
+def _utc(time: Any) -> datetime:
     """Return a time with its zone, which is UTC if none is stated."""
     moment = time if isinstance(time, datetime) else None
-    if moment is None:
+    if hasattr(time, "isot"):  # a Time of astropy, of any scale and format
+        moment = _utc_of_astropy(time)
+    elif moment is None:
         # Python reads a date alone as midnight, which the user hardly meant: refuse it.
         try:
             has_hours = re.search(r"\d[T ]\d", str(time))
@@ -246,6 +252,17 @@ def _utc(time: str | datetime) -> datetime:
             value=AsWritten(time),
         )
     return moment
+
+
+def _utc_of_astropy(time: Any) -> datetime | None:
+    """Return a Time of astropy as UTC; None if it is not one moment that a datetime can hold."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a "dubious year", as in `_terrestrial`
+        try:
+            moment = time.utc.datetime
+        except Exception:  # a leap second, a local time, or tables that astropy cannot load
+            return None
+    return moment if isinstance(moment, datetime) else None
 
 
 def _terrestrial(moment: datetime) -> tuple[float, float]:

@@ -15,11 +15,7 @@ from starcat.arrays import Array
 from starcat.catalog.stars.region import footprint_of_recorded
 from starcat.database.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import count_of
-from starcat.geometry.attitude import (
-    matrix_from_radec_roll,
-    radec_roll_from_matrix,
-    random_attitudes,
-)
+from starcat.geometry.attitude import HasAttitude, matrix_from_radec_roll, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.footprint import Footprint
 from starcat.geometry.sphere import Zones, radec_from_directions, zones_of
@@ -30,13 +26,14 @@ from starcat.resources import PathLike
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SimulatedFrame:
+class SimulatedFrame(HasAttitude):
     """One simulated frame.
 
     Attributes
     ----------
     matrix : ndarray of float64, shape (3, 3)
-        True attitude, ``body = matrix @ icrs``.
+        True attitude, ``body = matrix @ icrs``. ``q_body_from_icrs``, ``boresight_ra_deg``,
+        ``boresight_dec_deg`` and ``roll_deg`` state it as in a `MatchResult`.
     centroids_px : ndarray of float64, shape (N, 2)
         Measured centroids, in random order.
     star_index : ndarray of int64, shape (N,)
@@ -59,10 +56,10 @@ class SimulatedFrame:
         return int((self.star_index >= 0).sum())
 
     def __repr__(self) -> str:
-        ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(self.matrix)
         return (
             f"<SimulatedFrame: {count_of(len(self.centroids_px), 'centroid')}, {self.n_stars} of "
-            f"guide stars, RA {ra_deg:.4f}, Dec {dec_deg:+.4f}, roll {roll_deg:.4f} deg>"
+            f"guide stars, RA {self.boresight_ra_deg:.4f}, Dec {self.boresight_dec_deg:+.4f}, "
+            f"roll {self.roll_deg:.4f} deg>"
         )
 
     def _repr_html_(self) -> str:

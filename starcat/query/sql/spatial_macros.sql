@@ -53,3 +53,8 @@ CREATE MACRO _declination(dec) AS CASE
     WHEN dec BETWEEN -90 AND 90 THEN dec
     ELSE error('declination ' || dec || ' deg does not exist: give one from -90 to 90')
 END;
+-- A radius, if it is one; NaN is larger than all numbers.
+CREATE MACRO _radius(radius) AS CASE
+    WHEN radius >= 0 AND isfinite(radius::DOUBLE) THEN radius
+    ELSE error('a radius of ' || radius || ' deg does not exist: give a number from 0 on')
+END;

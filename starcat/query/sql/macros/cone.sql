@@ -9,10 +9,11 @@ FROM (
     SELECT *, separation(ra, dec, _place_ra_deg, _place_dec_deg) AS _apart
     FROM query_table('{places}.' || of)
     -- What prunes even where the numbers come from another table stands first.
-    WHERE _place_dec_deg BETWEEN _declination(dec) - radius - 1e-9
-        AND _declination(dec) + radius + 1e-9
+    WHERE _place_dec_deg BETWEEN _declination(dec) - _radius(radius) - 1e-9
+        AND _declination(dec) + _radius(radius) + 1e-9
 )
 WHERE _apart <= radius
     AND {places}._may_be_near(
-        _place_ra_deg, _place_file, getvariable('{places}.' || lower(of)), ra, dec, radius
+        _place_ra_deg, _place_file, getvariable('{places}.' || lower(of)),
+        ra, _declination(dec), _radius(radius)
     )
