@@ -112,7 +112,6 @@ def rows_of(name: str, values: Any, width: int, count: str = "N") -> Array:
     ConfigError
         If the values are not real numbers, have another shape, or their unit cannot be converted.
     """
-    expected = f"({count}, {width})"
     numbers: Array
     if type(values) is np.ndarray and values.dtype is FLOAT64 and values.shape[1:] == (width,):
         numbers = values  # fast path: nearly all calls
