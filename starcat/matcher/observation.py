@@ -503,10 +503,9 @@ def remarks_on_pixels(px: Pixels, camera: Camera) -> tuple[str, ...]:
             f"{remark}they seem to have another unit, such as millimetres or degrees; give pixels "
             "from the outer corner of the top-left pixel",
         )
-    beyond_px = float(np.maximum(-low, high - size).max())
+    outside, beyond_px = outside_of(px, camera)
     if beyond_px <= BEYOND_PX:
         return ()
-    outside = int(np.count_nonzero(~camera.contains(finite)))
     lie, were = ("lies", "was") if outside == 1 else ("lie", "were")
     remark = (
         f"{outside} of {len(px)} centroids {lie} outside of the frame of {size_text}, by up to "
@@ -525,6 +524,13 @@ def remarks_on_pixels(px: Pixels, camera: Camera) -> tuple[str, ...]:
         "that was found without it is wrong; pixels count from the outer corner of the top-left "
         "pixel, x to the right and y down",
     )
+
+
+def outside_of(px: Pixels, camera: Camera) -> tuple[int, float]:
+    """Return how many centroids lie outside of the frame, and how far, px; 0 if none does."""
+    finite = px[np.isfinite(px).all(axis=1)]
+    beyond_px = np.maximum(-finite, finite - 2.0 * camera.middle_px)
+    return int(np.count_nonzero(~camera.contains(finite))), float(beyond_px.max(initial=0.0))
 
 
 def known_magnitudes(mag: Array) -> Array:
