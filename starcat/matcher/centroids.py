@@ -224,6 +224,14 @@ def _frames_of_numpy(data: bytes, path: Path) -> list[MeasuredFrame]:
             columns = {name: arrays[name] for name in arrays.files}
     except ConfigError:
         raise
+    except zipfile.BadZipFile as error:
+        raise ConfigError(
+            f"{where}: begins as a ZIP archive and cannot be unpacked ({error})",
+            hint=(
+                "Save the table as CSV if it is a spreadsheet (xlsx, ods)",
+                "write it again if it is an npz file of NumPy",
+            ),
+        ) from error
     except Exception as error:  # damaged bytes make NumPy raise anything, even MemoryError
         raise ConfigError(f"{where}: cannot be read as a file of NumPy ({error})") from error
     if len(columns) == 1 and choose_columns(list(columns)) is None:

@@ -314,8 +314,14 @@ def test_arrays_of_numpy_are_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="at most 67,108,864 are read"):
         read_centroid_files(tmp_path / "c.npz")
     (tmp_path / "c.npz").write_bytes((tmp_path / "c.npz").read_bytes()[:-30])
+    (tmp_path / "d.xlsx").write_bytes(b"PK\x03\x04 no archive")
+    words = "begins as a ZIP archive and cannot be unpacked .*Save the table as CSV if it is a spr"
+    for name in ("c.npz", "d.xlsx"):
+        with pytest.raises(ConfigError, match=f"{name}: {words}"):
+            read_centroid_files(tmp_path / name)
+    (tmp_path / "a.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:-30])
     with pytest.raises(ConfigError, match="cannot be read as a file of NumPy"):
-        read_centroid_files(tmp_path / "c.npz")
+        read_centroid_files(tmp_path / "a.npy")
 
 
 def test_a_small_gzip_file_does_not_expand_without_limit(tmp_path: Path) -> None:
