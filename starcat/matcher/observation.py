@@ -181,6 +181,8 @@ def _error_of_column(what: str, values: Array, expected: str) -> ConfigError:
 def _per_centroid(name: str, values: ArrayLike, count: int) -> Array:
     numbers = numbers_of(name, values, (count,))
     if numbers.shape != (count,):
+        if name == "sigma_px" and numbers.ndim == 0:  # one noise for all
+            return np.full(count, numbers)
         raise _error_of_shape(f"{name} has", numbers, f"({count},), one a centroid", name)
     return numbers
 
