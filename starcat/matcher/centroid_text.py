@@ -232,8 +232,8 @@ def _read_rows(rows: Sequence[tuple[int, str]], header: _Header, where: str) -> 
         if index in beside or index < len(row):
             return np.nan
         raise ConfigError(
-            f"{where}: line {line}: {names[index]} is missing; expected a number, nan if it "
-            "is not known, or leave the line out"
+            f"{where}: line {line}: {names[index]} is missing; expected a number, or leave the "
+            "line out"
         )
 
     indices = [*places, *beside]

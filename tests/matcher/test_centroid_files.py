@@ -172,7 +172,7 @@ REFUSED = {
     "": "the file is empty; expected a first line x_px,y_px",
     " \n\n": "the file is empty",
     "# a\n# b\n": "has only comments; expected a first line",
-    "x_px,y_px\n1,2\n3\n": "line 3: y_px is missing; expected a number, nan if it is not known",
+    "x_px,y_px\n1,2\n3\n": "line 3: y_px is missing; expected a number, or leave the line out",
     "x_px y_px mag\n1 2 3\n4 5\n": "line 3 has fewer values than the 3 columns x_px, y_px, mag",
     "x_px,y_px\n455,5,327,25\n125,0,266,75\n": "line 2 has 4 values for the 2 columns.*semicolons",
     "x_px;y_px\n1.024,5;7.5\n": "line 2: x_px is '1.024,5'; expected a number",
