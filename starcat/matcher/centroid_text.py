@@ -228,7 +228,8 @@ def _read_rows(rows: Sequence[tuple[int, str]], header: _Header, where: str) -> 
             raise ConfigError(
                 f"{where}: line {line}: {names[index]} is {quoted(text)}; expected a number"
             )
-        if index in beside:
+        # A place that is empty is dropped by the matcher and reported, as NaN is.
+        if index in beside or index < len(row):
             return np.nan
         raise ConfigError(
             f"{where}: line {line}: {names[index]} is missing; expected a number, or leave the "

@@ -224,6 +224,14 @@ def _frames_of_numpy(data: bytes, path: Path) -> list[MeasuredFrame]:
             columns = {name: arrays[name] for name in arrays.files}
     except ConfigError:
         raise
+    except zipfile.BadZipFile as error:
+        raise ConfigError(
+            f"{where}: begins as a ZIP archive and cannot be unpacked ({error})",
+            hint=(
+                "Save the table as CSV if it is a spreadsheet (xlsx, ods)",
+                "write it again if it is an npz file of NumPy",
+            ),
+        ) from error
     except Exception as error:  # damaged bytes make NumPy raise anything, even MemoryError
         raise ConfigError(f"{where}: cannot be read as a file of NumPy ({error})") from error
     if len(columns) == 1 and choose_columns(list(columns)) is None:
@@ -302,7 +310,7 @@ def _json_frame(frame: Any, name: str, where: str) -> list[MeasuredFrame]:
             "the columns 'x_px' and 'y_px'"
         )
     numbers = {
-        key: [_number_or_nan(value, key, f"{where}: row {n}") for n, value in enumerate(values, 1)]
+        key: [_number(value, key, f"{where}: row {n}") for n, value in enumerate(values, 1)]
         if key != "frame"
         else values
         for key, values in columns.items()
@@ -378,7 +386,7 @@ def _per_centroid(frame: dict[str, Any], key: str, count: int, where: str) -> Ar
     if not isinstance(entries, list) or len(entries) != count:
         raise ConfigError(f"{where}: {key!r} has to be a list, one for each centroid")
     values = [
-        _number_or_nan(value, key, f"{where}: centroid {number}")
+        _number(value, key, f"{where}: centroid {number}")
         for number, value in enumerate(entries, start=1)
     ]
     return np.array(values, dtype=np.float64)
@@ -394,14 +402,13 @@ def exchanged(frame: MeasuredFrame) -> MeasuredFrame:
     return replace(frame, centroids_px=frame.centroids_px[:, ::-1])
 
 
-def _number_or_nan(value: Any, name: str, where: str) -> float:
-    return np.nan if value is None else _number(value, name, where)
-
-
 def _number(value: Any, name: str, where: str) -> float:
-    """Return a number; one that is not finite is left for the matcher to drop and report."""
+    """Return a number, NaN for null, as which JSON has NaN.
+
+    A place that is not finite is left for the matcher to drop and report.
+    """
     if value is None:
-        raise ConfigError(f"{where}: {name} is missing; expected a number")
+        return np.nan
     try:
         if isinstance(value, bool):
             raise ValueError

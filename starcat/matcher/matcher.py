@@ -215,9 +215,9 @@ class Matcher:
             Magnitudes. They decide what is tried first; with ``noise_mag`` also what is accepted,
             and then they must have the zero point of the database. NaN, a masked entry, and any
             number outside of -100 to 100 are unknown magnitudes.
-        sigma_px : array_like of float64, shape (N,), optional
-            Standard deviation of each centroid on each axis, NaN if unknown. They weight the
-            attitude of an answer and give its covariance. Stars do not depend on them.
+        sigma_px : float or array_like of float64, shape (N,), optional
+            Standard deviation of each centroid on each axis, or of all; NaN if unknown. They weight
+            the attitude of an answer and give its covariance. Stars do not depend on them.
         fov_error : float, optional
             Largest relative error of the camera's focal length, 0 to 0.5; by default 0. If it is
             above 0, the focal length is found with the attitude; this needs the method

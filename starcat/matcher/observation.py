@@ -181,6 +181,8 @@ def _error_of_column(what: str, values: Array, expected: str) -> ConfigError:
 def _per_centroid(name: str, values: ArrayLike, count: int) -> Array:
     numbers = numbers_of(name, values, (count,))
     if numbers.shape != (count,):
+        if name == "sigma_px" and numbers.ndim == 0:  # one noise for all
+            return np.full(count, numbers)
         raise _error_of_shape(f"{name} has", numbers, f"({count},), one a centroid", name)
     return numbers
 
@@ -455,8 +457,15 @@ def observe(
     )
 
 
-NOTABLE_OUTSIDE = 1.0 / 3.0
-"""Fraction of the centroids outside of the frame from which an answer has a remark."""
+BEYOND_PX = 5.0
+"""Distance from the frame that no noise explains: an answer has a remark on centroids beyond it.
+
+With a noise of 2 px, no star of 1000 frames was as far outside. If the size of a frame is larger
+than the camera's, hardly any other sign of it is left: the stars are right and the attitude is not.
+"""
+
+CENTRED_OUTSIDE = 1.0 / 3.0
+"""Least fraction outside of the frame if pixels count from its centre; three quarters are usual."""
 
 SMALL_EXTENT = 0.1
 """Fraction of the frame's width and height within which centroids are hardly pixels of it."""
@@ -496,21 +505,34 @@ def remarks_on_pixels(px: Pixels, camera: Camera) -> tuple[str, ...]:
             f"{remark}they seem to have another unit, such as millimetres or degrees; give pixels "
             "from the outer corner of the top-left pixel",
         )
-    outside = int(np.count_nonzero(~camera.contains(px) & np.isfinite(px).all(axis=1)))
-    if not outside >= NOTABLE_OUTSIDE * len(px):
+    outside, beyond_px = outside_of(px, camera)
+    if beyond_px <= BEYOND_PX:
         return ()
-    remark = f"{outside} of {len(px)} centroids lie outside of the frame of {size_text}"
+    lie, were = ("lies", "was") if outside == 1 else ("lie", "were")
+    remark = (
+        f"{outside} of {len(px)} centroids {lie} outside of the frame of {size_text}, by up to "
+        f"{beyond_px:.0f} px, and {were} dropped"
+    )
     # One pixel: the centroid of a star at the edge can lie a little beyond it.
-    if (low < 0.0).all() and (np.maximum(-low, high) <= 0.5 * size + 1.0).all():
+    is_centred = (low < 0.0).all() and (np.maximum(-low, high) <= 0.5 * size + 1.0).all()
+    if is_centred and outside >= CENTRED_OUTSIDE * count:
         return (
-            f"{remark}, and were dropped: x and y seem to count from the centre of the frame; add "
+            f"{remark}: x and y seem to count from the centre of the frame; add "
             f"{0.5 * camera.width_px:g} to x and {0.5 * camera.height_px:g} to y. An attitude that "
             "was found without this is wrong",
         )
     return (
-        f"{remark}, and were dropped: pixels count from the outer corner of the top-left pixel, x "
-        "to the right and y down; a frame of another size needs its own camera",
+        f"{remark}: if the frame has another size, state that or its camera, because an attitude "
+        "that was found without it is wrong; pixels count from the outer corner of the top-left "
+        "pixel, x to the right and y down",
     )
+
+
+def outside_of(px: Pixels, camera: Camera) -> tuple[int, float]:
+    """Return how many centroids lie outside of the frame, and how far, px; 0 if none does."""
+    finite = px[np.isfinite(px).all(axis=1)]
+    beyond_px = np.maximum(-finite, finite - 2.0 * camera.middle_px)
+    return int(np.count_nonzero(~camera.contains(finite))), float(beyond_px.max(initial=0.0))
 
 
 def known_magnitudes(mag: Array) -> Array:

@@ -330,6 +330,64 @@ def test_the_command_writes_a_camera_that_identifies(
     assert files.calibrated_toml(known).startswith("# Calibrated from 7 frames")
 
 
+@pytest.fixture(scope="module")
+def larger_frames(small_database, tmp_path_factory):
+    """Frames of 640 x 480 px of the small database's sky, and a file of them."""
+    folder, database = tmp_path_factory.mktemp("larger"), open_database(small_database)
+    camera = Camera(640, 480, database.camera.focal_length_px)
+    frames = list(simulate_frames(database.directions, camera, 12, Noise(0.2), 1, mag=database.mag))
+    path = folder / "larger.csv"
+    rows = [
+        f"{k},{x:.4f},{y:.4f},{mag:.3f}"
+        for k, frame in enumerate(frames)
+        for (x, y), mag in zip(frame.centroids_px, frame.mag, strict=True)
+    ]
+    path.write_text("\n".join(["frame,x_px,y_px,mag", *rows]) + "\n")
+    return camera, frames, path
+
+
+def test_frames_that_are_larger_than_the_camera_are_refused(
+    starcat, small_database, larger_frames, tmp_path
+):
+    _, frames, path = larger_frames
+    output = tmp_path / "camera.toml"
+    run = starcat(["calibrate", small_database, path, "-o", output])
+    assert (run.code, output.exists()) == (2, False)
+    said = " ".join(run.err.split())
+    outside = sum(int((frame.centroids_px >= 512.0).any(axis=1).sum()) for frame in frames)
+    assert f"{outside} of " in said
+    assert "lie outside of 512 x 512 px, the size of the camera of the database, by up to" in said
+    assert (
+        "state the size of the frames (--size), with the field across their width (--fov)" in said
+    )
+    run = starcat(
+        ["calibrate", small_database, path, "-o", output, "--size", "640x480", "--fov", "40:60"]
+    )
+    assert run.code == 0, run.err
+    assert "outside" not in run.err + run.out
+    assert (read_camera(output).width_px, read_camera(output).height_px) == (640, 480)
+    # With a size that is stated, stray centroids are dropped, with a remark.
+    known = calibrate(small_database, frames, size_px=(512, 512))
+    noted = [frame for frame in known.frames if frame.remarks]
+    assert len(noted) > 3
+    assert "outside of the frame of 512 x 512 px" in noted[0].remarks[0]
+
+
+def test_results_are_calibrated_with_the_size_of_their_camera(small_database, larger_frames):
+    camera, frames, _ = larger_frames
+    matcher = Matcher.open(small_database)
+    results = [matcher.identify(frame, camera) for frame in frames]
+    found = calibrate(small_database, results).camera
+    assert (found.width_px, found.height_px) == (640, 480)
+    assert found.focal_length_px == pytest.approx(camera.focal_length_px, rel=2e-3)
+    others = [matcher.identify(frame) for frame in frames]
+    with pytest.raises(ConfigError, match=r"cameras of 640 x 480 and 512 x 512 px.*\(camera\)"):
+        calibrate(small_database, [*results, *others])
+    assert calibrate(small_database, [*results, *others[:1]], camera=camera).camera.width_px == 640
+    with pytest.raises(ConfigError, match=r"size of the camera of the results.*\(size_px\)"):
+        calibrate(small_database, others)
+
+
 def test_json_has_the_covariance_and_every_model(starcat, small_database, small_frames, tmp_path):
     _, paths = small_frames
     dark = {"centroids_px": [[1, 2], [300, 400], [50, 60]], "light": [1, 2, 3]}

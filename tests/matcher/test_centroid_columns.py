@@ -11,12 +11,13 @@ import pyarrow as pa
 import pytest
 from astropy import units as u
 from astropy.table import QTable, Table
+from frames import both_engines
 
 import starcat
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroid_columns import BRIGHTNESS, POSITIONS
-from starcat.matcher.observation import remarks_on_pixels
+from starcat.matcher.observation import BEYOND_PX, remarks_on_pixels
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 
@@ -134,6 +135,42 @@ def test_coordinates_that_are_not_pixels_are_reported(kind, count):
     [remark] = remarks_on_pixels(change(px), CAMERA)
     assert words in remark
     assert remarks_on_pixels(np.vstack([change(px), [[np.nan, 1.0]]]), CAMERA)
+
+
+@both_engines
+def test_a_frame_of_another_size_has_a_remark(small_database, engine):
+    """All its stars are found, and the attitude is that of another boresight."""
+    matcher = starcat.Matcher.open(small_database, engine=engine)
+    camera = matcher.database.camera
+    larger = Camera(640, 480, camera.focal_length_px)
+    made = simulate_frames(
+        matcher.database.directions, larger, 40, Noise(0.2), 3, matcher.database.mag
+    )
+    few = 0
+    for one in made:
+        found = matcher.identify(one.centroids_px, mag=one.mag)
+        outside_px = float((one.centroids_px - (camera.width_px, camera.height_px)).max())
+        if not found.ok or outside_px <= BEYOND_PX:
+            continue
+        few += len(found.dropped) < len(one.centroids_px) / 3
+        [remark] = found.remarks
+        assert remark.startswith(f"{len(found.dropped)} of {len(one.centroids_px)} centroids lie")
+        assert f"outside of the frame of 512 x 512 px, by up to {outside_px:.0f} px" in remark
+        assert "if the frame has another size, state that or its camera" in remark
+        assert starcat.Matcher.open(small_database).identify(one, larger).remarks == ()
+    assert few >= 5
+
+
+def test_one_centroid_outside_is_reported_and_no_noise_at_the_border():
+    px = np.random.default_rng(1).uniform(0.0, 1024.0, (30, 2))
+    border = np.array([[-1.0, 3.0], [1025.0, 1024.9], [500.0, -4.0], [1028.0, 9.0]])
+    assert remarks_on_pixels(np.vstack([px, border]), CAMERA) == ()
+    [remark] = remarks_on_pixels(np.vstack([px, [[1100.2, 50.0]]]), CAMERA)
+    assert remark.startswith("1 of 31 centroids lies outside of the frame of 1024 x 1024 px, by up")
+    assert "76 px, and was dropped" in remark
+    # Few centroids about a corner do not count from the centre.
+    [remark] = remarks_on_pixels(np.vstack([px[:8] / 3.0, [[-20.0, -9.0]]]), CAMERA)
+    assert "count from the centre" not in remark
 
 
 def test_frames_of_stars_have_no_remarks_on_their_pixels(matcher):

@@ -172,8 +172,7 @@ REFUSED = {
     "": "the file is empty; expected a first line x_px,y_px",
     " \n\n": "the file is empty",
     "# a\n# b\n": "has only comments; expected a first line",
-    "x_px,y_px\n1,2\n3,\n": "line 3: y_px is missing; expected a number, or leave the line out",
-    "x_px,y_px\n1,2\n3\n": "line 3: y_px is missing",
+    "x_px,y_px\n1,2\n3\n": "line 3: y_px is missing; expected a number, or leave the line out",
     "x_px y_px mag\n1 2 3\n4 5\n": "line 3 has fewer values than the 3 columns x_px, y_px, mag",
     "x_px,y_px\n455,5,327,25\n125,0,266,75\n": "line 2 has 4 values for the 2 columns.*semicolons",
     "x_px;y_px\n1.024,5;7.5\n": "line 2: x_px is '1.024,5'; expected a number",
@@ -245,7 +244,8 @@ def test_shapes_of_json_are_read(shape: str, indent: int | None, tmp_path: Path)
         ({"x_px": [1, 2], "y_px": [3]}, "columns of 1 and 2 values"),
         ({"x_px": [1, "a"], "y_px": [3, 4]}, "row 2: x_px is 'a'; expected a number"),
         ([[1, 2], [3, 4, 5]], "rows of 2 and of 3 numbers"),
-        ({"centroids_px": [[1, None]]}, "centroid 1: y is missing; expected a number"),
+        ({"centroids_px": [[1, "a"]]}, "centroid 1: y is 'a'; expected a number"),
+        ({"centroids_px": [[1]]}, "centroid 1: \\[1\\]; expected a pair of numbers"),
     ],
 )
 def test_what_is_wrong_with_json_is_said(content, words, tmp_path: Path) -> None:
@@ -256,6 +256,26 @@ def test_what_is_wrong_with_json_is_said(content, words, tmp_path: Path) -> None
         return
     with pytest.raises(ConfigError, match=words):
         read_centroid_files(tmp_path / "a.json")
+
+
+WITHOUT_X = {
+    "pairs of a frame": '{"centroids_px": [[455.5, 327.25], [null, 3]]}',
+    "NaN": '{"centroids_px": [[455.5, 327.25], [NaN, 3]]}',
+    "pairs": "[[455.5, 327.25], [null, 3]]",
+    "columns": '{"x_px": [455.5, null], "y_px": [327.25, 3]}',
+    "csv": "x_px,y_px\n455.5,327.25\n,3\n",
+    "csv with null": "x_px;y_px;mag\n455.5;327.25;3\nnull;3;\n",
+    "csv with nan": "x_px,y_px\n455.5,327.25\nnan,3\n",
+    "tabs": "x_px\ty_px\n455.5\t327.25\n\t3\n",
+}
+
+
+@pytest.mark.parametrize("kind", WITHOUT_X)
+def test_a_place_that_is_null_or_empty_is_read_as_nan(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / ("a.json" if WITHOUT_X[kind].startswith(("{", "[")) else "a.csv")
+    path.write_text(WITHOUT_X[kind])
+    [frame] = read_centroid_files(path)
+    np.testing.assert_array_equal(frame.centroids_px, [PX[0], [np.nan, 3.0]])
 
 
 @pytest.mark.parametrize("name", ["a.json", "a.ndjson"])
@@ -294,8 +314,14 @@ def test_arrays_of_numpy_are_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="at most 67,108,864 are read"):
         read_centroid_files(tmp_path / "c.npz")
     (tmp_path / "c.npz").write_bytes((tmp_path / "c.npz").read_bytes()[:-30])
+    (tmp_path / "d.xlsx").write_bytes(b"PK\x03\x04 no archive")
+    words = "begins as a ZIP archive and cannot be unpacked .*Save the table as CSV if it is a spr"
+    for name in ("c.npz", "d.xlsx"):
+        with pytest.raises(ConfigError, match=f"{name}: {words}"):
+            read_centroid_files(tmp_path / name)
+    (tmp_path / "a.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:-30])
     with pytest.raises(ConfigError, match="cannot be read as a file of NumPy"):
-        read_centroid_files(tmp_path / "c.npz")
+        read_centroid_files(tmp_path / "a.npy")
 
 
 def test_a_small_gzip_file_does_not_expand_without_limit(tmp_path: Path) -> None:

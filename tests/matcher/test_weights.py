@@ -106,6 +106,13 @@ def test_many_frames_are_weighed_as_one(sky):
     assert told.q_body_from_icrs.tolist() == one.q_body_from_icrs.tolist()
     assert np.abs(plain.q_body_from_icrs - one.q_body_from_icrs).max() > 1e-9
     assert math.isnan(plain.reduced_chi_square)
+    same = np.full(len(sigma_px), 0.2)
+    known = matcher.identify(frames[1], sigma_px=same)
+    one = matcher.identify(frames[1], sigma_px=0.2)
+    assert one.frame.sigma_px.tolist() == same.tolist()
+    assert one == known
+    for told in matcher.identify_many(frames, sigma_px=[0.2, same]):
+        assert told.covariance_arcsec2.tolist() == known.covariance_arcsec2.tolist()
 
 
 @both_engines
@@ -136,6 +143,7 @@ def test_one_spot_that_is_known_to_be_bad_hardly_counts(sky):
         ([0.1, 0.2], r"sigma_px has shape \(2,\)"),
         ([0.1, 0.1, 0.0, 0.1], "sigma_px: 0 for centroid 2; expected above 0"),
         ([0.1, -0.1, 0.1, 0.1], "sigma_px: -0.1 for centroid 1"),
+        (0.0, "sigma_px: 0 for centroid 0; expected above 0"),
         (["a", 1, 1, 1], "not an array of real numbers"),
     ],
 )

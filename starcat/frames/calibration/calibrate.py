@@ -35,6 +35,7 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.frame_shape import turn_of_motion_deg_s
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.observation import remarks_on_pixels
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
 from starcat.results import entry, in_record, readable
@@ -231,7 +232,8 @@ def _outcomes(
                 turn_deg_s = math.hypot(shear, stretch) * turn_of_motion_deg_s(camera)
         count, matched = len(frame.centroids_px), result.n_matched
         reason = result.refusal.message if result.refusal else ""
-        remarks = tuple(dict.fromkeys([*frame.remarks, *result.remarks_on_frame]))
+        # The result is of the centroids in the frame alone.
+        remarks = *frame.remarks, *remarks_on_pixels(frame.centroids_px, camera)
         outcome = CalibratedFrame(
             frame.name, result.status, count, matched, residual_px, q, reason, remarks,
             stretch, shear, turn_deg_s,

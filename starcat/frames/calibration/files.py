@@ -17,7 +17,7 @@ import numpy as np
 
 from starcat.arguments import HasFolder, check_type, columns_of, path_of, whole_number, wrong_type
 from starcat.arrays import Array
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, count_of
 from starcat.frames.calibration.calibrate import Calibration, calibrate_frames
 from starcat.frames.calibration.fit import PARAMETERS
 from starcat.frames.images.batch import frame_files
@@ -26,7 +26,15 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.observation import FrameLike, as_arrays, frame_of_table, is_frame, remarks_of
+from starcat.matcher.observation import (
+    BEYOND_PX,
+    FrameLike,
+    as_arrays,
+    frame_of_table,
+    is_frame,
+    outside_of,
+    remarks_of,
+)
 from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 from starcat.pipeline.report.plots import STYLE, headline
@@ -46,17 +54,19 @@ if TYPE_CHECKING:
 USUAL_ERROR = 0.1
 
 
-def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
+def frames_given(frames: Any) -> tuple[list[Path | MeasuredFrame], list[Camera]]:
     """Return the files and frames that a caller gives to calibrate a camera from.
 
     Files are given as paths, folders and patterns, frames in any form that `Matcher.identify`
-    takes or as its results; both alone or in a sequence.
+    takes or as its results; both alone or in a sequence. Of results their cameras are returned,
+    too, those of identified frames first.
     """
     if _is_file(frames) or _is_one_frame(frames):
         frames = [frames]
     if not isinstance(frames, Iterable):
         raise wrong_type("frames", frames, _FRAMES)
     inputs: list[Path | MeasuredFrame] = []
+    results: list[MatchResult] = []
     for number, item in enumerate(frames, start=1):
         if _is_file(item):
             inputs += frame_files([str(path_of("frames", item))])
@@ -68,13 +78,19 @@ def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
                     parameter="frames",
                     hint="give the frame",
                 )
+            if isinstance(item, MatchResult):
+                results.append(item)
             name = str(getattr(frame, "name", "") or f"frame {number}")
             frame = frame_of_table(frame)
             remarks = remarks_of(frame)
             inputs.append(MeasuredFrame(name, *as_arrays(frame), remarks=remarks))
         else:
             raise wrong_type(f"frame {number} of frames", item, _FRAMES)
-    return list(dict.fromkeys(inputs))
+    results.sort(key=lambda result: not result.ok)
+    cameras = [
+        result.camera or result.frame.camera for result in results if result.frame is not None
+    ]
+    return list(dict.fromkeys(inputs)), cameras
 
 
 def _is_file(value: object) -> bool:
@@ -113,9 +129,10 @@ def calibrate(
         identify``; or frames as for `Matcher.identify`, for example from `simulate` or
         `read_frames`; or results, which contain their frames.
     camera : Camera, optional
-        The camera to start from; by default the database's camera.
+        The camera to start from; by default the camera of the results, or else the database's.
     size_px : tuple of int, optional
-        Width and height, if no camera is given; by default the size of the images.
+        Width and height, if no camera is given; by default the size of the images, or else of the
+        camera to start from. No centroid may then lie outside of it by more than noise.
     fov_deg : tuple of float, optional
         Smallest and largest field across the width, degrees; by default the camera's field, with
         a focal length that may be wrong by a tenth.
@@ -148,15 +165,51 @@ def calibrate(
         size_px = width_px, height_px
     matcher = database if isinstance(database, Matcher) else Matcher.open(database, method)
     advance = progress or no_progress
-    measured, image_size_px = measured_frames(frames_given(frames), flip=flip, progress=advance)
+    inputs, of_results = frames_given(frames)
+    measured, image_size_px = measured_frames(inputs, flip=flip, progress=advance)
+    is_stated = not (camera is None and size_px is None)
+    if of_results and not is_stated:
+        _expect_one_size(of_results)
     start, focal_px = starting_camera(
         matcher.database.camera,
+        of_results=of_results[0] if of_results else None,
         camera=camera,
         size_px=size_px,
         image_size_px=image_size_px,
         fov_deg=fov_deg,
     )
+    if not is_stated and image_size_px is None:
+        _expect_inside(measured, start, "the results" if of_results else "the database")
     return calibrate_frames(matcher, measured, start, focal_px, advance)
+
+
+def _expect_one_size(cameras: Sequence[Camera]) -> None:
+    """Raise `ConfigError` if the cameras of results have several sizes."""
+    sizes = dict.fromkeys(f"{camera.width_px} x {camera.height_px}" for camera in cameras)
+    if len(sizes) > 1:
+        raise ConfigError(
+            f"the results are of cameras of {' and '.join(sizes)} px; expected one camera",
+            hint=("give the results of one camera", "state the camera of all frames ({camera})"),
+        )
+
+
+def _expect_inside(frames: Sequence[MeasuredFrame], camera: Camera, whose: str) -> None:
+    """Raise `ConfigError` if frames whose size nobody stated are larger than a camera."""
+    found = [(frame, *outside_of(frame.centroids_px, camera)) for frame in frames]
+    worst, _, beyond_px = max(found, key=lambda one: one[2], default=(None, 0, 0.0))
+    if worst is None or beyond_px <= BEYOND_PX:
+        return
+    count = sum(len(frame.centroids_px) for frame in frames)
+    raise ConfigError(
+        f"{sum(outside for _, outside, _ in found)} of {count_of(count, 'centroid')} lie outside "
+        f"of {camera.width_px} x {camera.height_px} px, the size of the camera of {whose}, by up "
+        f"to {beyond_px:.0f} px ({worst.name})",
+        hint=(
+            "state the size of the frames ({size_px}), with the field across their width "
+            "({fov_deg}) if it is another size",
+            "give their camera ({camera})",
+        ),
+    )
 
 
 def measured_frames(
@@ -205,6 +258,7 @@ def names_of_files(paths: Sequence[Path]) -> list[str]:
 def starting_camera(
     database_camera: Camera,
     *,
+    of_results: Camera | None = None,
     camera: Camera | None = None,
     size_px: tuple[int, int] | None = None,
     image_size_px: tuple[int, int] | None = None,
@@ -213,7 +267,7 @@ def starting_camera(
     """Return the camera and the range of focal lengths with which a calibration begins."""
     if camera is not None and size_px is not None:
         raise ConfigError("give either a camera or its size, not both; a camera has a size")
-    start = camera or database_camera
+    start = camera or of_results or database_camera
     said = size_px or (None if camera is None else (camera.width_px, camera.height_px))
     if image_size_px is not None and said not in (None, image_size_px):
         raise ConfigError(
@@ -226,7 +280,7 @@ def starting_camera(
         if frame_size_px != (start.width_px, start.height_px):
             raise ConfigError(
                 f"the frames have {frame_size_px[0]} x {frame_size_px[1]} px, the camera of the "
-                f"database {start.width_px} x {start.height_px}",
+                f"{'results' if of_results else 'database'} {start.width_px} x {start.height_px}",
                 hint=(
                     "say the field across their width with {fov_deg}, such as 5:20",
                     "give a camera file",
