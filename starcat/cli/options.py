@@ -62,6 +62,7 @@ SPELLINGS = {
     "inputs": "input",
     "keep_out_deg": "keep-out",
     "memory_bytes": "memory",
+    "prior": "prior-q",
     "products": "product",
     "values": "set",
     "velocity_km_s": "velocity",
@@ -70,8 +71,12 @@ SPELLINGS = {
 """Options without a declaration that are spelled differently from the parameter."""
 
 
-def option_of(parameter: str, value: str = "", item: str = "", command: str = "") -> str:
-    """Return the option of the command line for a parameter of a function.
+WITHOUT_OPTION = ("origin",)
+"""Parameters that only Python has."""
+
+
+def option_of(parameter: str, value: str = "", item: str = "", command: str = "") -> str | None:
+    """Return the option of the command line for a parameter of a function; None if it has none.
 
     Examples
     --------
@@ -80,6 +85,8 @@ def option_of(parameter: str, value: str = "", item: str = "", command: str = ""
     >>> option_of("inputs", item="sao"), option_of("inputs", item="sao", command="starcat sql")
     ('--input sao=PATH', "'starcat sql sao=PATH'")
     """
+    if parameter in WITHOUT_OPTION:
+        return None
     if parameter == "per" and command not in ("starcat bands", "starcat init"):
         return f"per = {value}"  # a key of the spec, for which these two commands have an option
     declared = OPTIONS[parameter].spellings[:1] if parameter in OPTIONS else ()
@@ -366,7 +373,12 @@ def observer_of_options(
                 "--velocity and --orbit are both given",
                 hint="leave out --velocity, which --orbit holds too",
             )
-        state = observer_numbers("--orbit", orbit, 6)
-        return Observer.at(time, position_km=state[:3], velocity_km_s=state[3:])
-    speed = None if velocity is None else observer_numbers("--velocity", velocity, 3)
+        state = observer_numbers("orbit", orbit, 6)
+        try:
+            return Observer.at(time, position_km=state[:3], velocity_km_s=state[3:])
+        except ConfigError as error:
+            if error.parameter in ("position_km", "velocity_km_s"):
+                error.parameter, error.value = "orbit", orbit
+            raise
+    speed = None if velocity is None else observer_numbers("velocity", velocity, 3)
     return Observer.at(time, velocity_km_s=speed)
