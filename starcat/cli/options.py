@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.errors import ConfigError, Unstated
+from starcat.errors import ConfigError, Unstated, literal
 from starcat.matcher.option_texts import size_in_px
 from starcat.matcher.options import OPTIONS, IdentifyOptions, Option, options_of
 
@@ -47,11 +47,23 @@ def _refuse_other_files(path: Path) -> None:
     }
     for kind, suffixes in kinds.items():
         if path.suffix.lower() in suffixes:
+            refuse_part_of_database(path)
             raise ConfigError(
                 f"{path} is {kind}",
                 hint="the database comes first: the folder <name>-<version> that 'starcat build' "
                 "made",
             )
+
+
+def refuse_part_of_database(path: Path) -> None:
+    """Raise ConfigError for a file of a database that is named in place of its folder."""
+    from starcat.database.manifest import MANIFEST_NAME
+
+    is_part = path.suffix.lower() in (".h5", ".json", ".parquet")
+    if is_part and (path.parent / MANIFEST_NAME).is_file():
+        raise ConfigError(
+            f"{path} is one file of a database", hint=f"give its folder {literal(path.parent)}"
+        )
 
 
 SPELLINGS = {
