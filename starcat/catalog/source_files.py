@@ -275,11 +275,18 @@ def locate(source_name: str, inputs: Mapping[str, Sequence[Path]]) -> list[Path]
         source=source_name,
         hint=(
             f"Name it with {{inputs[{source_name}]}}",
-            f"set ${CATALOGS_VARIABLE} to the folder that has "
-            f"{literal(source.main_file.file_names[-1])}[.gz]",
+            f"set ${CATALOGS_VARIABLE} to the folder that has {literal(_usual_file(source))}",
             *_served(source),
         ),
     )
+
+
+def _usual_file(source: DataSource) -> str:
+    """Return the name of a file by which a source is found, in words."""
+    names = source.main_file.file_names
+    if source.table is None:
+        return f"{names[-1]}[.gz]"
+    return " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def _served(source: DataSource) -> list[str]:

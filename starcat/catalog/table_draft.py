@@ -25,7 +25,7 @@ _ID = (
 _RULES = (
     ("ra", r"pos\.eq\.ra", rf"(ra|alpha|rightascension){_WHEN}"),
     ("dec", r"pos\.eq\.dec", rf"(de|decl?|delta|declination){_WHEN}"),
-    ("ra", r"pos\.galactic\.lon", r"(glon|gall|lii|l|galacticlongitude)(deg|rad)?"),
+    ("ra", r"pos\.galactic\.lon", r"(glon|gall|lii|galacticlongitude)(deg|rad)?"),
     ("dec", r"pos\.galactic\.lat", r"(glat|galb|bii|galacticlatitude)(deg|rad)?"),
     ("pm_ra_cosdec", r"pos\.pm.*(\.ra|\.lon)", r"(pm|mu)(ra|alpha|a|l|glon)(star|cos(de?c?|b))?"),
     ("pm_dec", r"pos\.pm.*(\.dec|\.lat)", r"(pm|mu)(de|dec|decl|delta|d|b|glat)"),
@@ -164,6 +164,8 @@ def _guesses(draft: MapDraft) -> Iterator[tuple[str, str]]:
                     error = f"{key.removesuffix('_cosdec')}_error"
                     if not is_error or error in UNITS:
                         yield error if is_error else key, name
+        if not by_ucd and not {"columns.ra", "columns.dec"} & draft.entries.keys():
+            yield from zip(("ra", "dec"), _galactic_pair(draft), strict=False)
         yield from _magnitudes(draft, by_ucd=by_ucd)
     if not any(key.startswith("magnitudes.") for key in draft.entries):
         yield from _by_unit(draft)
@@ -171,6 +173,12 @@ def _guesses(draft: MapDraft) -> Iterator[tuple[str, str]]:
         if "columns.star_id" not in draft.entries and f"columns.{short}" in draft.entries:
             draft.entries["columns.star_id"] = draft.entries[f"columns.{short}"]
             draft.used |= {name: "star_id" for name, key in draft.used.items() if key == short}
+
+
+def _galactic_pair(draft: MapDraft) -> tuple[str, ...]:
+    """Return the columns l and b, galactic longitude and latitude; without l, b is a magnitude."""
+    pairs = (("l", "b"), ("l_deg", "b_deg"), ("l_rad", "b_rad"))
+    return next((pair for pair in pairs if draft.columns.keys() >= set(pair)), ())
 
 
 def _base(name: str, column: TableColumn) -> tuple[str, bool]:
@@ -181,6 +189,8 @@ def _base(name: str, column: TableColumn) -> tuple[str, bool]:
 
 def _magnitudes(draft: MapDraft, *, by_ucd: bool) -> Iterator[tuple[str, str]]:
     for name, column in draft.columns.items():
+        if name in _galactic_pair(draft):
+            continue
         base, is_error = _base(re.sub(r"\s*[\[(].*?[\])]", "", name), column)
         match = re.search(r"phot\.(?:mag|flux).*em\.[a-z]+\.(?P<band>[A-Za-z]+)$", column.ucd)
         if not by_ucd:
@@ -326,6 +336,8 @@ def _propose_frame_and_epoch(draft: MapDraft) -> None:
     top: dict[str, str] = {}
     if re.search(r"glon|gall|galactic|lii", coordinates):
         top["frame"] = '"galactic"'
+    elif set(_galactic_pair(draft)) & {n for n, key in draft.used.items() if key in ("ra", "dec")}:
+        top["frame"] = '"galactic"  # a guess, after the names of the columns: look at it'
     elif year and year[1] == "1950":
         top["frame"] = '"FK4"'
     elif year and year[1] != "2000":

@@ -50,7 +50,7 @@ def blend_command(
     spec, position = _spec_and_position(words or [])
     build_spec = opt.chosen_spec(spec, preset, changes)
     if position is None and separation is not None and mags is not None:
-        view = sensor_view_of_pair(build_spec, separation, observer_numbers("--mags", mags, 2))
+        view = sensor_view_of_pair(build_spec, separation, observer_numbers("mags", mags, 2))
     elif position is not None and separation is None and mags is None:
         with progress_bars() as progress:
             paths_by_source = opt.inputs_by_source(inputs)

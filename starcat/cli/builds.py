@@ -10,6 +10,7 @@ import typer
 
 from starcat.cli.catalogs import print_problems, record_rows
 from starcat.cli.console import (
+    command_line,
     print_json,
     print_record,
     print_rows,
@@ -196,11 +197,13 @@ def print_built(built: Built, *, as_json: bool) -> None:
 
 
 def _say_next(folder: Path) -> None:
-    say(
-        f"go on with:\n  starcat simulate {folder} -o frame.csv\n"
-        f"  starcat identify {folder} frame.csv\n"
-        f"  starcat export {folder} --to onboard -o {folder.name}.img"
-    )
+    say("go on with:")
+    for words in (
+        ("simulate", folder, "-o", "frame.csv"),
+        ("identify", folder, "frame.csv"),
+        ("export", folder, "--to", "onboard", "-o", f"{folder.name}.img"),
+    ):
+        say(f"  {command_line('starcat', *words)}")
 
 
 def _print_contents(built: Built) -> None:

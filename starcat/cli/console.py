@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -366,6 +367,17 @@ def warn(texts: Iterable[str]) -> None:
 def say(text: str) -> None:
     """Print a message on stderr."""
     sys.stderr.write(text + "\n")
+
+
+def command_line(*words: object) -> str:
+    """Return a command to copy into a shell, with quotes where words need them.
+
+    Examples
+    --------
+    >>> command_line("starcat", "build", "cam.toml", "--input", "mk=my catalog.csv")
+    "starcat build cam.toml --input 'mk=my catalog.csv'"
+    """
+    return shlex.join(map(str, words))
 
 
 @contextmanager

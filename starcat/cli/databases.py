@@ -19,7 +19,7 @@ from starcat.cli.console import (
     show_result,
     warn,
 )
-from starcat.cli.options import Input, Json, database, inputs_by_source
+from starcat.cli.options import Input, Json, database, inputs_by_source, refuse_part_of_database
 from starcat.cli.outputs import Replace, expect_free, to_folder
 from starcat.errors import ConfigError, ProductError, count_of
 from starcat.results import to_dict
@@ -47,6 +47,7 @@ def inspect(
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
     if database.is_file():
+        refuse_part_of_database(database)
         from starcat.database.onboard.patching import image_signatures
         from starcat.database.onboard.reading import read_onboard_image
 
@@ -124,6 +125,7 @@ def verify_command(
     from starcat.ship.releases.registry import is_registry
 
     if Path(database).is_file():
+        refuse_part_of_database(Path(database))
         from starcat.ship.exchange.onboard import verify_image
 
         verification = verify_image(Path(database), against, trust)

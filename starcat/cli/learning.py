@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from starcat.cli import options as opt
-from starcat.cli.console import say, show_result
+from starcat.cli.console import command_line, say, show_result
 from starcat.cli.outputs import Replace, expect_free, to_file
 from starcat.errors import ConfigError
 
@@ -89,7 +89,7 @@ def learn_command(
     for path in filter(None, (output, stars)):
         say(f"written: {path}")
     if patch is not None:
-        say(f"go on with: starcat build {output}")
+        say(f"go on with: {command_line('starcat', 'build', output)}")
 
 
 def _files_of(texts: list[str]) -> list[Path]:

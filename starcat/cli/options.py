@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.errors import ConfigError, Unstated
+from starcat.errors import ConfigError, Unstated, literal
 from starcat.matcher.option_texts import size_in_px
 from starcat.matcher.options import OPTIONS, IdentifyOptions, Option, options_of
 
@@ -47,11 +47,23 @@ def _refuse_other_files(path: Path) -> None:
     }
     for kind, suffixes in kinds.items():
         if path.suffix.lower() in suffixes:
+            refuse_part_of_database(path)
             raise ConfigError(
                 f"{path} is {kind}",
                 hint="the database comes first: the folder <name>-<version> that 'starcat build' "
                 "made",
             )
+
+
+def refuse_part_of_database(path: Path) -> None:
+    """Raise ConfigError for a file of a database that is named in place of its folder."""
+    from starcat.database.manifest import MANIFEST_NAME
+
+    is_part = path.suffix.lower() in (".h5", ".json", ".parquet")
+    if is_part and (path.parent / MANIFEST_NAME).is_file():
+        raise ConfigError(
+            f"{path} is one file of a database", hint=f"give its folder {literal(path.parent)}"
+        )
 
 
 SPELLINGS = {
@@ -62,6 +74,7 @@ SPELLINGS = {
     "inputs": "input",
     "keep_out_deg": "keep-out",
     "memory_bytes": "memory",
+    "prior": "prior-q",
     "products": "product",
     "values": "set",
     "velocity_km_s": "velocity",
@@ -70,8 +83,12 @@ SPELLINGS = {
 """Options without a declaration that are spelled differently from the parameter."""
 
 
-def option_of(parameter: str, value: str = "", item: str = "", command: str = "") -> str:
-    """Return the option of the command line for a parameter of a function.
+WITHOUT_OPTION = ("origin",)
+"""Parameters that only Python has."""
+
+
+def option_of(parameter: str, value: str = "", item: str = "", command: str = "") -> str | None:
+    """Return the option of the command line for a parameter of a function; None if it has none.
 
     Examples
     --------
@@ -80,6 +97,8 @@ def option_of(parameter: str, value: str = "", item: str = "", command: str = ""
     >>> option_of("inputs", item="sao"), option_of("inputs", item="sao", command="starcat sql")
     ('--input sao=PATH', "'starcat sql sao=PATH'")
     """
+    if parameter in WITHOUT_OPTION:
+        return None
     if parameter == "per" and command not in ("starcat bands", "starcat init"):
         return f"per = {value}"  # a key of the spec, for which these two commands have an option
     declared = OPTIONS[parameter].spellings[:1] if parameter in OPTIONS else ()
@@ -366,7 +385,12 @@ def observer_of_options(
                 "--velocity and --orbit are both given",
                 hint="leave out --velocity, which --orbit holds too",
             )
-        state = observer_numbers("--orbit", orbit, 6)
-        return Observer.at(time, position_km=state[:3], velocity_km_s=state[3:])
-    speed = None if velocity is None else observer_numbers("--velocity", velocity, 3)
+        state = observer_numbers("orbit", orbit, 6)
+        try:
+            return Observer.at(time, position_km=state[:3], velocity_km_s=state[3:])
+        except ConfigError as error:
+            if error.parameter in ("position_km", "velocity_km_s"):
+                error.parameter, error.value = "orbit", orbit
+            raise
+    speed = None if velocity is None else observer_numbers("velocity", velocity, 3)
     return Observer.at(time, velocity_km_s=speed)

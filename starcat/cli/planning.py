@@ -80,7 +80,7 @@ def plan_command(
         database,
         _attitudes(attitudes, time),
         orbit=orbit,
-        alignment=None if alignment is None else observer_numbers("--alignment", alignment, 4),
+        alignment=None if alignment is None else observer_numbers("alignment", alignment, 4),
         camera=None if camera is None else read_camera(camera),
         keep_out_deg=_keep_out(keep_out),
         **options,

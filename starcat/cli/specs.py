@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.console import print_json, print_record, progress_bars, say, show_result, warn
+from starcat.cli.console import (
+    command_line,
+    print_json,
+    print_record,
+    progress_bars,
+    say,
+    show_result,
+    warn,
+)
 from starcat.cli.options import (
     Changes,
     Input,
@@ -356,10 +364,11 @@ def _show_starter(
     if starter.catalog.is_embedded and starter.row_of_spec.faint_limit_mag >= starter.deepest_mag:
         say("a deeper catalog: --catalog SOURCE with its --input, as for 'starcat build'")
     say(figures.in_words)
-    options = [f" --source {map_file}" for map_file in sources or ()]
-    options += [
-        f" --input {source}={where}"
-        for source, paths in starter.catalog.inputs.items()
-        for where in paths
-    ]
-    say(f"wrote {path}; change it as you like, then: starcat build {path}{''.join(options)}")
+    options: list[object] = []
+    for map_file in sources or ():
+        options += ["--source", map_file]
+    for source, paths in starter.catalog.inputs.items():
+        for where in paths:
+            options += ["--input", f"{source}={where}"]
+    build = command_line("starcat", "build", path, *options)
+    say(f"wrote {path}; change it as you like, then: {build}")

@@ -13,14 +13,14 @@ from starcat.catalog.store.wire import url_of_input
 from starcat.database.diff import Change, changes_between
 from starcat.database.manifest import MANIFEST_NAME, read_manifest
 from starcat.database.reader import DatabaseFolder, open_database_folder
-from starcat.errors import ChecksumMismatch
+from starcat.errors import ChecksumMismatch, SourceMissing
 from starcat.pipeline.build import build
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.reading import check_inputs
 from starcat.pipeline.specs.reading import spec_of_database
 from starcat.progress import Progress, no_progress
 from starcat.results import in_record
-from starcat.storage.atomic import file_sha256
+from starcat.storage.atomic import MAX_NAMED, file_sha256
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,14 @@ def _same_inputs(old: DatabaseFolder, inputs: Inputs, progress: Progress) -> Inp
     progress("check inputs", 0, None)
     for facts in old.manifest["sources"]:
         name = facts["source"]
-        inputs_by_source[name] = locate(name, inputs)
+        try:
+            inputs_by_source[name] = locate(name, inputs)
+        except SourceMissing as error:
+            files = [file["name"] for file in facts["files"]]
+            more = f" and {len(files) - MAX_NAMED:,} more" if len(files) > MAX_NAMED else ""
+            named = ", ".join(files[:MAX_NAMED])
+            error.problem += f"; {old.folder.name} was made from {named}{more}"
+            raise
         if any(map(url_of_input, inputs_by_source[name])):
             continue
         paths = [

@@ -192,11 +192,21 @@ def whole_folder(final: Path) -> Iterator[Path]:
             partial.chmod(0o755)
             with writing(final.parent, "nothing was left there"):
                 yield partial
+        except OutputError as error:
+            _name_final(error, partial, final)
+            raise
         finally:
             shutil.rmtree(partial, ignore_errors=True)
             if is_new:
                 with suppress(OSError):  # it is not empty
                     final.parent.rmdir()
+
+
+def _name_final(error: OutputError, partial: Path, final: Path) -> None:
+    """State the final name of a folder in an error about a file of the unfinished one."""
+    if error.path is not None and error.path == error.where and partial in error.path.parents:
+        error.problem = f"{error.path.relative_to(partial).as_posix()}: {error.problem}"
+        error.where = error.path = final
 
 
 def remove_abandoned(final: Path) -> None:

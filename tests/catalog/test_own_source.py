@@ -29,7 +29,7 @@ from starcat.catalog.store.ingest import ingest_to_store
 from starcat.catalog.store.reading import read_catalog
 from starcat.catalog.table_check import check_map
 from starcat.catalog.table_draft import draft_map
-from starcat.errors import ConfigError, SourceError
+from starcat.errors import ConfigError, SourceError, SourceMissing
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.pipeline.build import build
 from starcat.pipeline.rebuild import rebuild
@@ -319,6 +319,23 @@ def test_check_says_units_ranges_and_what_is_missing(tmp_path: Path):
     assert [row["row"] for row in found["first_rows"]] == [1, 2, 3, 4, 5]
     assert found["rejected"] == {"no_position": 1}
     assert found["unused_columns"] == []
+
+
+@pytest.mark.parametrize(
+    ("more", "files"),
+    [
+        ("", "mine.csv, mine.tsv, mine.ecsv, mine.fits, .* or mine.feather"),
+        ('file_names = ["my stars.csv"]\n', "my stars.csv"),
+    ],
+)
+def test_a_table_that_is_not_found_is_named_as_it_is_searched(tmp_path, monkeypatch, more, files):
+    monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path))
+    with (
+        source.known_maps([tomllib.loads(more + MAP)]),
+        pytest.raises(SourceMissing, match=rf"set \$STARCAT_CATALOGS to .* that has {files}$"),
+    ):
+        locate("mine", {})
 
 
 @pytest.mark.slow
@@ -621,6 +638,22 @@ def test_a_draft_takes_a_column_in_magnitudes(tmp_path: Path):
     odd = {"e_w4": [0.1] * u.mag, "w4-w3": [0.2] * u.mag, "w4": [5.1] * u.mag}
     Table({"no": [1], "ra": [100.5], "dec": [20.5], **odd}).write(tmp_path / "odd.fits")
     assert draft_map(tmp_path / "odd.fits").used["w4"] == "magnitudes.w4"
+
+
+def test_a_draft_of_galactic_coordinates_states_their_frame(tmp_path: Path):
+    (tmp_path / "gal.tsv").write_text("id\tl\tb\tV\n1\t100.5\t-20.5\t5.1\n2\t7\t3\t6.1\n")
+    text = draft_map(tmp_path / "gal.tsv").as_toml()
+    content = tomllib.loads(text)
+    assert content["columns"] == {"star_id": "id", "ra": "l", "dec": "b"}
+    assert (content["frame"], content["magnitudes"]) == ("galactic", {"V": "V"})
+    assert 'frame = "galactic"  # a guess' in text
+    # Gaia has both; without l a column b is a magnitude.
+    for columns, magnitudes in (("l,b,g", {"G": "g"}), ("b,v", {"B": "b", "V": "v"})):
+        row = "1,100.5,20.5," + ",".join(["5.1"] * (columns.count(",") + 1))
+        (tmp_path / "both.csv").write_text(f"id,ra,dec,{columns}\n{row}\n")
+        content = tomllib.loads(draft_map(tmp_path / "both.csv").as_toml())
+        assert content["columns"] == {"star_id": "id", "ra": "ra", "dec": "dec"}
+        assert ("frame" in content, content["magnitudes"]) == (False, magnitudes)
 
 
 @pytest.mark.parametrize(

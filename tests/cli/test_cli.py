@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -229,17 +230,18 @@ def test_ingest_as_json(starcat, sao_file, tmp_path):
 def test_build_prints_what_it_made(starcat, sao_file, small_spec, tmp_path):
     spec = tmp_path / "spec.toml"
     spec.write_text(small_spec)
-    arguments = ["build", spec, "--input", f"sao={sao_file}", "-o", tmp_path / "dist"]
+    folder = tmp_path / "für später"
+    arguments = ["build", spec, "--input", f"sao={sao_file}", "-o", folder]
     run = starcat(arguments)
     assert run.code == 0
-    database = tmp_path / "dist" / "small-1.0.0"
+    database = folder / "small-1.0.0"
     estimate, _, rest = run.err.partition("\n")
     assert estimate.startswith("estimate: ")
     written, report, go_on, *commands = rest.splitlines()
     assert written == f"written: {database}"
     assert report == f"report: {database / 'report' / 'index.html'}"
     assert go_on == "go on with:"
-    assert [line.split()[:3] for line in commands] == [
+    assert [shlex.split(line)[:3] for line in commands] == [
         ["starcat", name, str(database)] for name in ("simulate", "identify", "export")
     ]
     assert (database / "report" / "index.html").is_file()
@@ -254,7 +256,7 @@ def test_build_prints_what_it_made(starcat, sao_file, small_spec, tmp_path):
         "folder", "report", "outcome", "filters", "coverage", "self_test", "warnings", "times_s",
         "sources", "products", "files",
     ]  # fmt: skip
-    assert made["folder"] == str(tmp_path / "dist" / "small-1.0.0")
+    assert made["folder"] == str(database)
     assert [step["step"] for step in made["filters"]] == ["magnitude", "doubles", "variables"]
     assert made["self_test"][0]["identified_share"] == 1.0
 

@@ -219,6 +219,11 @@ def test_the_command_writes_a_section_a_table_and_json(starcat, small_database, 
     assert found.toml == section.read_text()
     assert len(found.table) == len(rows)
     assert starcat_package.learn(small_database, [path], min_frames=1000).lesson.distrusted == ()
+    copy = tmp_path / "b.ndjson"
+    copy.write_bytes(path.read_bytes())
+    for again in (copy, path):
+        refused = starcat(["learn", small_database, path, again])
+        assert f"{again}: has the same content as {path}; give it once" in refused.err
 
 
 def test_a_build_rejects_the_distrusted_stars(small_spec, sao_file):

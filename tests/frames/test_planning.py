@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -300,6 +301,7 @@ def test_the_command_prints_a_table_json_and_a_plot(small_database, starcat, tmp
         ([DATA / "orbit.oem"], "ATTITUDE_TYPE is missing"),
         (["10,20,30", "--orbit", DATA / "orbit.oem"], "the attitudes have no time"),
         (["10,20,30", "--alignment", "1,1,1,1"], "--alignment is [1.0, 1.0, 1.0, 1.0]"),
+        (["10,20,30", "--alignment", "1,2"], "error: --alignment is '1,2'"),
         (["10,20,30", "--plot", "plan.pdf"], "plan.pdf: a plot is one of"),
     ],
 )
@@ -309,6 +311,19 @@ def test_what_is_wrong_is_said_in_the_words_of_the_command_line(
     ran = starcat(["plan", small_database, *arguments])
     assert ran.code != 0
     assert words in ran.err
+
+
+def test_an_orbit_in_metres_is_refused_by_its_time(small_database, starcat, tmp_path):
+    text = (DATA / "orbit.oem").read_text()
+    numbers = re.compile(r"(?<= )(-?[0-9]+\.[0-9]+)")
+    (tmp_path / "orbit.oem").write_text(numbers.sub(lambda n: f"{1000 * float(n[1]):.6f}", text))
+    attitude = ["10,20,30", "--time", "2027-03-01T06:30:00"]
+    ran = starcat(["plan", small_database, *attitude, "--orbit", tmp_path / "orbit.oem"])
+    place = "[7000000.0, -0.0, 0.0] at 2027-03-01T06:30:00"
+    expected = "expected at most 3,000,000 km from the middle of the Earth"
+    assert ran.err.strip().endswith(
+        f"--orbit is {place}; {expected}; divide a position in metres by 1000"
+    )
 
 
 @pytest.mark.parametrize(

@@ -194,13 +194,15 @@ def test_a_database_of_another_range_and_catalog_is_built_once(built_specs, sao_
 
 
 def test_init_takes_the_catalog_that_is_named(starcat, sao_file, tmp_path):
-    spec, given = tmp_path / "own.toml", f"sao={sao_file}"
+    catalog = tmp_path / "mein katalog.dat"
+    catalog.write_bytes(sao_file.read_bytes())
+    spec, given = tmp_path / "own.toml", f"sao={catalog}"
     camera = ["--size", "512x512", "--fov-x-deg", "40"]
     run = starcat(["init", spec, *camera, "--catalog", "sao", "--input", given])
     assert run.code == 0, run.err
     content = tomllib.loads(spec.read_text())
     assert (content["catalog"]["source"], content["catalog"]["band"]) == ("sao", "V")
-    assert f"starcat build {spec} --input {given}" in run.err
+    assert f"starcat build {spec} --input '{given}'" in run.err
     assert "limits in V" in run.out
     spec.unlink()
     for options, words in (

@@ -11,7 +11,7 @@ from starcat.cli.console import show_result
 from starcat.database import manifest as manifest_module
 from starcat.database.diff import Change
 from starcat.database.manifest import MANIFEST_NAME
-from starcat.errors import ChecksumMismatch, ConfigError
+from starcat.errors import ChecksumMismatch, ConfigError, SourceMissing
 from starcat.pipeline.rebuild import FileChange, Rebuilt, rebuild
 from starcat.storage.parquet import read_parquet, write_parquet
 
@@ -47,6 +47,13 @@ def test_another_input_is_refused(small_database, sao_file):
         rebuild(small_database, {"sao": [sao_file, other]})
     with pytest.raises(ConfigError, match="does not read gaia"):
         rebuild(small_database, {"sao": [sao_file], "gaia": [sao_file]})
+
+
+def test_a_missing_input_is_named(small_database, monkeypatch, tmp_path):
+    monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path))
+    with pytest.raises(SourceMissing, match=r"no file found in .*; small-1.0.0 was made from sao"):
+        rebuild(small_database, {})
 
 
 def test_what_differs_is_named(database_copy, sao_file, tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import subprocess
@@ -123,6 +124,22 @@ def test_a_folder_appears_when_it_is_whole_and_cannot_be_changed(tmp_path):
     files = [path for path in final.rglob("*") if path.is_file()]
     assert [mode_of(path) for path in files] == [0o444, 0o444]
     assert mode_of(final) == 0o755
+
+
+def test_an_error_of_an_unfinished_folder_names_the_final_one(tmp_path):
+    final = tmp_path / "tables"
+    with (
+        pytest.raises(OutputError) as caught,
+        atomic.whole_folder(final) as partial,
+        atomic.whole_file(partial / "more" / "stars.csv"),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert str(caught.value) == (
+        f"{final}: more/stars.csv: cannot be written (No space left on device); "
+        "choose another output"
+    )
+    assert caught.value.path == final
+    assert names_in(tmp_path) == []
 
 
 def filled(folder: Path, **files: str) -> Path:

@@ -148,16 +148,18 @@ def evaluate_command(
         _evaluate_sensor(database, ecss, output, method, frames, seed, quick, workers, json, others)
         return
     files, eye = inputs_by_source(inputs), read_camera(camera) if camera else None
+    sweep = None
+    if database is not None:
+        sweep = plan_sweep(
+            database, values, method=method, camera=eye, frames=frames,
+            tolerance_px=tolerance_px, seed=seed, quick=quick,
+        )  # fmt: skip
     with _progress_towards(output) as progress:
-        if database is None:
+        if sweep is None:
             evaluation = evaluate_papers(
                 paper or "all", files, output, quick=quick, workers=workers, progress=progress
             )
         else:
-            sweep = plan_sweep(
-                database, values, method=method, camera=eye, frames=frames,
-                tolerance_px=tolerance_px, seed=seed, quick=quick,
-            )  # fmt: skip
             evaluation = evaluate_database(sweep, output, workers=workers, progress=progress)
     print_evaluation(evaluation, as_json=json)
 

@@ -23,6 +23,7 @@ from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, 
 class Parameter:
     """A quantity with one value per experiment."""
 
+    name: str  # its key of `PARAMETERS`, the option of the command line
     label: str  # the quantity in words, with its unit
     usual: tuple[float, ...]  # default values of a sweep; empty: not varied by default
     low: float  # values outside of this range are invalid
@@ -30,32 +31,38 @@ class Parameter:
     # function that returns its value in an experiment; NaN if the experiment has none
     read: Callable[[Experiment], float]
     write: Callable[[Experiment, float], Experiment]  # the same experiment with another value
+    is_count: bool = False  # whether its values are whole numbers
+
+    def check(self, value: float) -> None:
+        """Check that this quantity can have a value."""
+        expected = ""
+        if not self.low <= value <= self.high:
+            expected = f"{self.low:g} to {self.high:g}"
+        elif self.is_count and value != int(value):
+            expected = "a whole number"
+        if expected:
+            raise ConfigError(f"expected {expected}", parameter=self.name, value=value)
 
     def with_value(self, experiment: Experiment, value: float) -> Experiment:
         """Return an experiment with another value of this quantity."""
-        if not self.low <= value <= self.high:
-            raise ConfigError(
-                f"{self.label}: {value:g} is out of range; expected {self.low:g} to {self.high:g}",
-                value=value,
-            )
+        self.check(value)
         try:
             return self.write(experiment, value)
         except ValueError as error:
-            raise ConfigError(f"{self.label}: {value:g}: {error}", value=value) from error
+            raise ConfigError(str(error), parameter=self.name, value=value) from error
 
 
 def _noise(name: str, label: str, usual: tuple[float, ...], low: float, high: float) -> Parameter:
     is_count = isinstance(getattr(Noise, name), int)
 
     def write(experiment: Experiment, value: float) -> Experiment:
-        if is_count and value != int(value):
-            raise ValueError("expected a whole number")
         change: dict[str, Any] = {name: int(value) if is_count else value}
         return replace(experiment, noise=replace(experiment.noise, **change))
 
     return Parameter(
-        label, usual, low, high, lambda experiment: float(getattr(experiment.noise, name)), write
-    )
+        name, label, usual, low, high,
+        lambda experiment: float(getattr(experiment.noise, name)), write, is_count,
+    )  # fmt: skip
 
 
 def _cameras(experiment: Experiment) -> tuple[Camera, Camera]:
@@ -110,16 +117,16 @@ PARAMETERS: dict[str, Parameter] = {
         "drop_probability", "chance of a star to be missing", (0.0, 0.1, 0.2, 0.4), 0.0, 1.0
     ),
     "k1": Parameter(
-        "distortion k1 that the matcher does not know",
+        "k1", "distortion k1 that the matcher does not know",
         (-0.5, -0.2, -0.1, 0.0), -10.0, 10.0, _k1, _with_k1,
     ),
     "roll_deg": Parameter(
-        "roll about a guide star, deg", (0.0, 45.0, 90.0, 135.0, 180.0), -360.0, 360.0,
+        "roll_deg", "roll about a guide star, deg", (0.0, 45.0, 90.0, 135.0, 180.0), -360.0, 360.0,
         _roll_deg, _with_roll,
     ),
     "scale": Parameter(
-        "true focal length over the assumed one", (0.99, 0.995, 1.0, 1.005, 1.01), 0.1, 10.0,
-        _scale, _with_scale,
+        "scale", "true focal length over the assumed one",
+        (0.99, 0.995, 1.0, 1.005, 1.01), 0.1, 10.0, _scale, _with_scale,
     ),
     "limit_mag": _noise("limit_mag", "faintest magnitude that is seen, mag", (), -30.0, 40.0),
 }  # fmt: skip
@@ -218,6 +225,8 @@ def _values_to_try(values: Mapping[str, Sequence[float]]) -> dict[str, tuple[flo
                 + ", ".join(PARAMETERS),
                 key=name,
             )
+        for value in points:
+            PARAMETERS[name].check(value)
     ordered = {name: tuple(sorted(set(points))) for name, points in values.items()}
     return ordered or {name: axis.usual for name, axis in PARAMETERS.items() if axis.usual}
 

@@ -328,7 +328,7 @@ def test_axes_keep_each_other_s_values_and_refuse_what_is_out_of_range():
     wrong = {"noise_px": -0.1, "false_stars": 1.5, "false_share": 1.0, "k1": -9.0, "scale": 0.0,
              "drop_probability": math.nan}  # fmt: skip
     for name, value in wrong.items():
-        with pytest.raises(ConfigError, match=re.escape(PARAMETERS[name].label)):
+        with pytest.raises(ConfigError, match=f"^{name} is .*; expected"):
             PARAMETERS[name].with_value(BASE, value)
 
 
@@ -678,3 +678,15 @@ def test_curves_are_of_all_pointings_with_their_intervals(small_database, tmp_pa
         for point in curve["points"]:
             assert point["low_percent"] <= point["percent"] <= point["high_percent"]
             assert point["percent"] == 50.0 * point["hits"]
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [("--drop-probability", "0,1.5", "0 to 1"), ("--false-stars", "1.5", "a whole number")],
+)
+def test_a_wrong_value_is_said_before_the_place_of_the_results(
+    small_database, starcat, tmp_path, option, value, expected
+):
+    ran = starcat(["evaluate", small_database, option, value, "-o", tmp_path / "out"])
+    assert ran.err.strip() == f"starcat: error: {option} is 1.5; expected {expected}"
+    assert not list(tmp_path.iterdir())

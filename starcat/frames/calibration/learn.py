@@ -485,6 +485,21 @@ class Learnt:
         return name or str(self.stars.star_id[star.row])
 
 
+def _different_digests(files: Sequence[Path]) -> tuple[str, ...]:
+    """Return the SHA-256 of each file; ConfigError if two have the same content."""
+    files_by_digest: dict[str, Path] = {}
+    for path in files:
+        digest = file_sha256(path)
+        if digest in files_by_digest:
+            raise ConfigError(
+                f"has the same content as {files_by_digest[digest]}",
+                where=path,
+                hint="give it once, so that each frame counts once",
+            )
+        files_by_digest[digest] = path
+    return tuple(files_by_digest)
+
+
 def learn(
     database: HasFolder | PathLike,
     results: PathLike | Sequence[PathLike],
@@ -522,6 +537,7 @@ def learn(
     files = paths_of("results", results)
     stars, bands = sky_stars(opened)
     answers = read_answers(files, stars)
+    digests = _different_digests(files)
     count = len(answers.names)
     before = spec_of_database(opened).selection.observed
     lesson = learn_from_frames(
@@ -550,7 +566,7 @@ def learn(
         "frames": count,
         "database": stars.name,
         "manifest_sha256": manifest_digest(opened.manifest),
-        "results_sha256": tuple(file_sha256(path) for path in files),
+        "results_sha256": digests,
     }
     try:
         observed = Observed.model_validate(content)

@@ -19,7 +19,7 @@ import numpy as np
 
 from starcat.arguments import columns_of, numbers_of, path_of, rows_of
 from starcat.arrays import Array
-from starcat.errors import ConfigError, count_of
+from starcat.errors import AsWritten, ConfigError, count_of
 from starcat.frames.sky.observer import Observer
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.storage.regular_files import read_regular_file
@@ -84,10 +84,18 @@ class Orbit:
         a, b = 2.0 * (p - q) + v + w, 3.0 * (q - p) - 2.0 * v - w
         position = ((a * s + b) * s + v) * s + p
         velocity = ((3.0 * a * s + 2.0 * b) * s + v) / step
-        return [
-            Observer.at(time, position_km=here_km, velocity_km_s=speed)
-            for time, here_km, speed in zip(times, position, velocity, strict=True)
-        ]
+        return [_observer(*state) for state in zip(times, position, velocity, strict=True)]
+
+
+def _observer(time: datetime, position_km: Array, velocity_km_s: Array) -> Observer:
+    """Return the observer in an orbit at a time; ConfigError names the orbit and the time."""
+    try:
+        return Observer.at(time, position_km=position_km, velocity_km_s=velocity_km_s)
+    except ConfigError as error:
+        error.parameter = "orbit"
+        error.value = AsWritten(f"{error.value} at {time:%Y-%m-%dT%H:%M:%S}")
+        error.hint = error.advice[:1]  # the others are about the arguments of `Observer.at`
+        raise
 
 
 def attitudes_of(value: Any, alignment: Any = None) -> PlannedAttitudes:

@@ -68,6 +68,13 @@ Origin = Literal["earth", "barycentre"]
 FASTEST_KM_S: dict[Origin, float] = {"earth": 100.0, "barycentre": 300.0}
 """Fastest observers; the fastest spacecraft so far, Parker Solar Probe, passes the Sun at 192."""
 
+NEAREST_KM = 6356.0
+"""Smallest distance from the middle of the Earth: its poles are at 6,356.75 km."""
+
+FARTHEST_KM: dict[Origin, float] = {"earth": 3e6, "barycentre": 5e10}
+"""Largest distances from the origin: observers at the Lagrange points L1 and L2 stay within 2
+million km of the Earth, and Voyager 1 is at 2.5e10 km. Positions in metres are beyond them."""
+
 FIRST_YEAR, LAST_YEAR = 1900, 2099  # years of the ephemeris
 DAY_S = 86_400.0
 
@@ -144,7 +151,8 @@ class Observer:
         Raises
         ------
         ConfigError
-            If an argument is out of range, such as a time before 1900 or after 2099, or missing.
+            If an argument is out of range, such as a time before 1900 or after 2099 or a position
+            inside the Earth, or missing.
         """
         moment = _utc(time)
         tt = _terrestrial(moment)
@@ -165,8 +173,11 @@ class Observer:
         else:
             position_au = earth_au + (0.0 if position is None else position / AU_KM)
             velocity = earth_au_day * (AU_KM / DAY_S) + (0.0 if speed is None else speed)
+        if position is not None:
+            from_earth_km = _length(position_au - earth_au) * AU_KM
+            _check_place(position, from_earth_km, origin)
         fastest, relative_km_s = FASTEST_KM_S[origin], np.zeros(3) if speed is None else speed
-        if not np.sqrt(relative_km_s @ relative_km_s) <= fastest:
+        if not _length(relative_km_s) <= fastest:
             raise ConfigError(
                 f"expected at most {fastest:g} km/s relative to the {origin}",
                 parameter="velocity_km_s",
@@ -198,6 +209,35 @@ class Observer:
             parallax = numbers_of_array("parallax_mas", parallax_mas, "(N,)")
             u = _displaced_by_parallax(u, parallax, self.position_au)
         return aberrated(_deflected(u, self.position_au - self.sun_au), self.velocity_km_s)
+
+
+def _length(vector: Array) -> float:
+    return float(np.sqrt(vector @ vector))
+
+
+def _check_place(position_km: Array, from_earth_km: float, origin: Origin) -> None:
+    """Check that an observer is outside of the Earth, and not too far from the origin."""
+    hint: tuple[str, ...]
+    if from_earth_km < NEAREST_KM:
+        expected = f"at least {NEAREST_KM:,.0f} km from the middle of the Earth"
+        hint = ("add the radius of the Earth, 6,378 km, to an altitude",)
+    elif _length(position_km) > FARTHEST_KM[origin]:
+        middle = "the middle of the Earth" if origin == "earth" else "the barycentre"
+        expected = f"at most {FARTHEST_KM[origin]:,.0f} km from {middle}"
+        hint = ("divide a position in metres by 1000",)
+        if origin == "earth":
+            hint += (
+                "give {velocity_km_s} alone if the observer is farther away",
+                'state both relative to the barycentre ({origin:"barycentre"})',
+            )
+    else:
+        return
+    raise ConfigError(
+        f"expected {expected}",
+        parameter="position_km",
+        value=np.round(position_km, 1).tolist(),
+        hint=hint,
+    )
 
 
 def observer_numbers(name: str, text: str, count: int) -> list[float]:
