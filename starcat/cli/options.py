@@ -83,12 +83,8 @@ SPELLINGS = {
 """Options without a declaration that are spelled differently from the parameter."""
 
 
-WITHOUT_OPTION = ("origin",)
-"""Parameters that only Python has."""
-
-
-def option_of(parameter: str, value: str = "", item: str = "", command: str = "") -> str | None:
-    """Return the option of the command line for a parameter of a function; None if it has none.
+def option_of(parameter: str, value: str = "", item: str = "", command: str = "") -> str:
+    """Return the option of the command line for a parameter of a function.
 
     Examples
     --------
@@ -97,8 +93,6 @@ def option_of(parameter: str, value: str = "", item: str = "", command: str = ""
     >>> option_of("inputs", item="sao"), option_of("inputs", item="sao", command="starcat sql")
     ('--input sao=PATH', "'starcat sql sao=PATH'")
     """
-    if parameter in WITHOUT_OPTION:
-        return None
     if parameter == "per" and command not in ("starcat bands", "starcat init"):
         return f"per = {value}"  # a key of the spec, for which these two commands have an option
     declared = OPTIONS[parameter].spellings[:1] if parameter in OPTIONS else ()

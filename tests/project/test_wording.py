@@ -96,8 +96,8 @@ def test_messages_of_the_library_name_no_option_of_the_command_line():
 
 
 OF_PYTHON = {
-    *("--distortion", "--engine", "--fov-y-deg", "--image", "--max-turn-deg", "--parallax-mas"),
-    *("--position-km", "--sigma-px", "--time-s", "--x"),
+    *("--distortion", "--engine", "--fov-y-deg", "--image", "--max-turn-deg", "--origin"),
+    *("--parallax-mas", "--position-km", "--sigma-px", "--time-s", "--x"),
 }
 """Parameters of functions that no command has; x is a name in a value."""
 
@@ -111,12 +111,10 @@ def test_every_parameter_of_a_message_has_an_option():
         if isinstance(node, ast.keyword) and node.arg in ("hint", "parameter")
         for text in texts_of(node.value)
     ]
-    options: set[str | None] = set()
+    options: set[str] = set()
 
     def collected(parameter: str, value: str, item: str) -> str:
-        option = option_of(parameter, value, item, "starcat bands")
-        if option is not None:
-            options.add(option.split()[0])
+        options.add(option_of(parameter, value, item, "starcat bands").split()[0])
         return parameter
 
     for text in (*named, *(text for hint in HINTS.values() for text in hint)):

@@ -71,9 +71,8 @@ FASTEST_KM_S: dict[Origin, float] = {"earth": 100.0, "barycentre": 300.0}
 NEAREST_KM = 6356.0
 """Smallest distance from the middle of the Earth: its poles are at 6,356.75 km."""
 
-FARTHEST_KM: dict[Origin, float] = {"earth": 3e6, "barycentre": 5e10}
-"""Largest distances from the origin: observers at the Lagrange points L1 and L2 stay within 2
-million km of the Earth, and Voyager 1 is at 2.5e10 km. Positions in metres are beyond them."""
+FARTHEST_KM = 5e10
+"""Largest distance from the origin; Voyager 1 is at 2.5e10 km."""
 
 FIRST_YEAR, LAST_YEAR = 1900, 2099  # years of the ephemeris
 DAY_S = 86_400.0
@@ -175,7 +174,7 @@ class Observer:
             velocity = earth_au_day * (AU_KM / DAY_S) + (0.0 if speed is None else speed)
         if position is not None:
             from_earth_km = _length(position_au - earth_au) * AU_KM
-            _check_place(position, from_earth_km, origin)
+            _check_place(position, from_earth_km)
         fastest, relative_km_s = FASTEST_KM_S[origin], np.zeros(3) if speed is None else speed
         if not _length(relative_km_s) <= fastest:
             raise ConfigError(
@@ -215,21 +214,14 @@ def _length(vector: Array) -> float:
     return float(np.sqrt(vector @ vector))
 
 
-def _check_place(position_km: Array, from_earth_km: float, origin: Origin) -> None:
-    """Check that an observer is outside of the Earth, and not too far from the origin."""
-    hint: tuple[str, ...]
+def _check_place(position_km: Array, from_earth_km: float) -> None:
+    """Check that an observer is outside of the Earth, and not beyond all spacecraft."""
     if from_earth_km < NEAREST_KM:
         expected = f"at least {NEAREST_KM:,.0f} km from the middle of the Earth"
-        hint = ("add the radius of the Earth, 6,378 km, to an altitude",)
-    elif _length(position_km) > FARTHEST_KM[origin]:
-        middle = "the middle of the Earth" if origin == "earth" else "the barycentre"
-        expected = f"at most {FARTHEST_KM[origin]:,.0f} km from {middle}"
-        hint = ("divide a position in metres by 1000",)
-        if origin == "earth":
-            hint += (
-                "give {velocity_km_s} alone if the observer is farther away",
-                'state both relative to the barycentre ({origin:"barycentre"})',
-            )
+        hint = "add the radius of the Earth, 6,378 km, to an altitude"
+    elif _length(position_km) > FARTHEST_KM:
+        expected = f"at most {FARTHEST_KM:,.0f} km"
+        hint = "divide a position in metres by 1000"
     else:
         return
     raise ConfigError(
