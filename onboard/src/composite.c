@@ -108,19 +108,21 @@ static int match_spots(const starcat_call *call, const starcat_composite *c,
   turn_centroids(call, count, m);
   for (uint32_t k = 0; k < c->n_spots; k++) {
     real nearest = most->spot_square;
-    w->seen[k] = 0;
-    w->weight[k] = R(0.0);
+    uint32_t row = count;
     for (uint32_t i = 0; i < count; i++) {
       const real apart = starcat_chord_square(w->seen_icrs[i], c->body[k]);
       if (apart < nearest) {
         nearest = apart;
-        w->seen[k] = (uint16_t)i;
-        w->weight[k] = R(1.0);
+        row = i;
       }
     }
-    if (w->weight[k] > R(0.0)) {
-      shared += w->before[w->seen[k]] == 0 ? 1u : 0u;
-      w->before[w->seen[k]] = 1;
+    w->seen[k] = 0;
+    w->weight[k] = R(0.0);
+    if (row < count) {
+      w->seen[k] = (uint16_t)row;
+      w->weight[k] = R(1.0);
+      shared += w->before[row] == 0 ? 1u : 0u;
+      w->before[row] = 1;
     }
   }
   return starcat_spend_steps(call, count * c->n_spots) && (shared >= LEAST_SHARED);
